@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import importlib.util
 import pkgutil
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Literal
@@ -21,6 +23,7 @@ TransportKind = Literal["serial", "can", "udp", "tcp", "gnss", "imu", "ntrip"]
 STREAM_TRANSPORTS: tuple[TransportKind, ...] = ("serial", "udp", "tcp")  # every wire that carries a byte stream
 
 KINDS: tuple[DeviceKind, ...] = ("gnss", "imu", "scanner", "corrections")
+MOST_ALIKE = 3
 FOLDERS: dict[DeviceKind, tuple[str, ...]] = {  # where drivers of a kind are declared: a receiver may hold an IMU and
     "gnss": ("gnss", "imu"),  # an IMU a receiver, and one protocol file then declares both
     "imu": ("imu", "gnss"),
@@ -33,7 +36,7 @@ RECEIVER_RECORDS = (TimeMessage, GnssFix, GnssHeading, EventMark)
 
 
 class UnknownProtocolError(LookupError):
-    """No driver of that kind has that protocol; the text lists the protocols that exist."""
+    """No driver of that kind has that protocol; the text names the one that was probably meant, or all that exist."""
 
 
 @cache
@@ -69,14 +72,48 @@ def find_driver(kind: DeviceKind, protocol: str) -> Driver:
     """Return the driver of a protocol.
 
     Raises:
-        UnknownProtocolError: the protocol is unknown; the text lists the known ones.
+        UnknownProtocolError: the protocol is unknown; the text names those that were probably meant, or all known ones.
     """
     drivers = all_drivers(kind)
     try:
         return drivers[protocol]
     except KeyError:
-        known = ", ".join(sorted(drivers))
-        raise UnknownProtocolError(f"unknown {kind} protocol {protocol!r}; there are: {known}") from None
+        meant = probable_protocols(protocol, drivers)
+        known = f"did you mean {' or '.join(meant)}?" if meant else f"there are: {', '.join(sorted(drivers))}"
+        raise UnknownProtocolError(f"unknown {kind} protocol {protocol!r}; {known}") from None
+
+
+def probable_protocols(wanted: str, drivers: Mapping[str, Driver]) -> list[str]:
+    """Return the protocols that a misspelt name probably means.
+
+    The first of these rules that finds any counts: the same letters and digits; the same without the maker; a part
+    between the hyphens; the name or all its words in protocol and summary (``septentrio``, ``PandarXT-32``); at most
+    three similar names.
+    """
+    letters = _letters(wanted)
+    if not letters:
+        return []
+    words = [_letters(word) for word in re.split(r"[^0-9A-Za-z]+", wanted) if word]
+    in_words = {name: _letters(f"{name} {driver.summary}") for name, driver in drivers.items()}
+    parts = {name: {name, *name.split("-")} for name in drivers}
+    rules: tuple[Callable[[str], bool], ...] = (
+        lambda name: _letters(name) == letters,
+        lambda name: _letters(name.partition("-")[2]) == letters,
+        lambda name: letters in map(_letters, parts[name]),
+        lambda name: len(letters) > 2 and letters in in_words[name],
+        lambda name: len(letters) > 2 and all(word in in_words[name] for word in words),
+    )
+    for rule in rules:
+        if found := sorted(name for name in drivers if rule(name)):
+            return found
+    alike = {part: name for name in sorted(drivers) for part in parts[name]}
+    close = difflib.get_close_matches(wanted.lower(), alike, n=MOST_ALIKE, cutoff=0.6)
+    return list(dict.fromkeys(alike[part] for part in close))
+
+
+def _letters(text: str) -> str:
+    """Return the letters and digits of a text, in lower case."""
+    return re.sub(r"[^0-9a-z]", "", text.lower())
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,7 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from swath.drivers.driver import KINDS, Driver, UnknownProtocolError, all_drivers, find_driver
-from swath.drivers.parser import DeviceSettings, DriverSettingsError, Parser
+from swath.drivers.parser import DeviceKind, DeviceSettings, DriverSettingsError, Parser
 from swath.georef.records import Chunk, ChunkBatch
 from tests.drivers.recordings import FIXTURES
 from tests.fuzz.recordings import settings_of
@@ -106,9 +106,36 @@ def test_only_drivers_that_declare_needs_refuse_empty_settings(driver: Driver) -
     assert not said or any(key in said for key in driver.needs), f"names none of {driver.needs}: {said}"
 
 
-def test_error_for_an_unknown_protocol_lists_the_known_ones() -> None:
-    with pytest.raises(UnknownProtocolError, match=r"nmea, .*ubx"):
-        find_driver("gnss", "nema")
+@pytest.mark.parametrize(
+    ("kind", "wanted", "meant"),
+    [
+        ("scanner", "vlp16", "velodyne-vlp16?"),
+        ("scanner", "VLP-16", "velodyne-vlp16?"),
+        ("scanner", "Velodyne_VLP32C", "velodyne-vlp32c?"),
+        ("scanner", "xt32", "hesai-xt32?"),
+        ("scanner", "hesai xt-32", "hesai-xt32?"),
+        ("scanner", "PandarXT-16", "hesai-xt16?"),
+        ("scanner", "puck hi-res", "velodyne-vlp16-hires?"),
+        ("scanner", "OS1", "ouster?"),
+        ("scanner", "velodyne-vpl16", "did you mean velodyne-vlp16 or "),
+        ("gnss", "septentrio", "sbf?"),
+        ("gnss", "u-blox", "ubx?"),
+        ("gnss", "OEM7", "novatel?"),
+        ("gnss", "nema", "nmea?"),
+        ("imu", "ellipse", "sbg-ellipse?"),
+        ("imu", "xsens", "xsens-mti or xsens-xbus?"),
+        ("scanner", "hesai", "did you mean hesai-qt128 or hesai-qt64 or hesai-xt16 or "),
+        ("gnss", "-", "there are: "),
+        ("gnss", "qqq", "there are: "),
+        ("scanner", "vlp-16\0\n", "velodyne-vlp16?"),
+    ],
+)
+def test_error_for_an_unknown_protocol_names_the_probable_one(kind: DeviceKind, wanted: str, meant: str) -> None:
+    with pytest.raises(UnknownProtocolError) as refused:
+        find_driver(kind, wanted)
+    text = str(refused.value)
+    assert text.startswith(f"unknown {kind} protocol {wanted!r}; ")
+    assert f"did you mean {meant}" in text if meant.endswith("?") else meant in text
 
 
 def make_and_feed(parser: Parser, units: list[bytes]) -> None:
