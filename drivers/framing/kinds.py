@@ -228,6 +228,26 @@ def novatel_ascii_name(frame: bytes) -> str:
     return name[:-1] if name.endswith("A") else name
 
 
+# --- Unicore binary: AA 44 B5, 24 bytes of header, message, CRC-32 (N4 command reference, binary header) --------------
+
+UNICORE_HEADER_BYTES = 24
+UNICORE_MAX_MESSAGE_BYTES = 16 * 1024  # the longest, OBSVM of 400 signals with 40 bytes each
+UNICORE_LENGTHS = struct.Struct("<4xHH")  # message id, message length
+
+
+def measure_unicore(buffer: bytes, start: int, final: bool) -> int:
+    """Measure header, message and CRC."""
+    if len(buffer) - start < UNICORE_LENGTHS.size:
+        return UNDECIDED
+    message = UNICORE_LENGTHS.unpack_from(buffer, start)[1]
+    return UNICORE_HEADER_BYTES + message + 4 if message <= UNICORE_MAX_MESSAGE_BYTES else OVER_BOUND
+
+
+def unicore_name(frame: bytes) -> str:
+    """Return a name such as ``UNICORE-2118``; `swath.drivers.gnss.unicore` has the real names."""
+    return f"UNICORE-{UNICORE_LENGTHS.unpack_from(frame)[0]}"
+
+
 # --- Xbus: FA FF, message identifier, length, data, checksum (Xsens MT Low-Level Communication Protocol) --------------
 
 XBUS_MAX_DATA_BYTES = 2048  # data of a message with an extended length
@@ -325,6 +345,14 @@ NOVATEL_SHORT = FrameKind(
     novatel_name,
 )
 
+UNICORE = FrameKind(
+    "unicore",
+    (b"\xaa", b"D", b"\xb5"),
+    UNICORE_HEADER_BYTES + UNICORE_MAX_MESSAGE_BYTES + 4,
+    measure_unicore,
+    lambda frame: crc32_novatel(frame) == 0,
+    unicore_name,
+)
 NOVATEL_ASCII = FrameKind(
     "novatel-ascii",
     (b"#%", bytes(range(0x41, 0x5B))),

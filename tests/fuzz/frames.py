@@ -68,6 +68,12 @@ def _seal_novatel_short(frame: bytes) -> bytes:
     return bytes(content) + struct.pack("<I", crc32_novatel(content))
 
 
+def _seal_unicore(frame: bytes) -> bytes:
+    content = bytearray(b"\xaaD\xb5" + frame[3:-4].ljust(21, b"\0")[: 21 + 16 * 1024])
+    struct.pack_into("<H", content, 6, len(content) - 24)
+    return bytes(content) + struct.pack("<I", crc32_novatel(content))
+
+
 def _seal_novatel_ascii(frame: bytes) -> bytes:
     sync = frame[:1] if frame[:1] in (b"#", b"%") else b"#"
     text = frame[1:].rpartition(b"*")[0] or frame[1:]
@@ -120,6 +126,7 @@ SEALS: dict[str, Callable[[bytes], bytes]] = {
     "novatel": _seal_novatel,
     "novatel-short": _seal_novatel_short,
     "novatel-ascii": _seal_novatel_ascii,
+    "unicore": _seal_unicore,
     "xbus": _seal_xbus,
     "sbf": _seal_sbf,
     "vectornav": _seal_vectornav,

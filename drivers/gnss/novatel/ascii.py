@@ -10,7 +10,7 @@ import csv
 import re
 import struct
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from swath.drivers.framing.checksums import crc32_novatel
 from swath.drivers.framing.kinds import NOVATEL_ASCII_TAIL_BYTES
@@ -41,6 +41,9 @@ SECONDARY = "_1"  # as in the binary header's source; older firmware sends other
 GREATEST_WEEK = 0xFFFF
 WEEK_S = 604_800
 SOFTWARE = 17002
+
+
+BodyT = TypeVar("BodyT")
 
 
 class FieldError(ValueError):
@@ -98,7 +101,7 @@ def _seconds(text: str) -> float:
     return seconds
 
 
-def read_body(body: type[nov.Body], wire: struct.Struct, texts: list[str]) -> nov.Body:
+def read_body(body: type[BodyT], wire: struct.Struct, texts: list[str]) -> BodyT:
     """Read the fields of a body, as its binary form has them.
 
     Raises:
@@ -107,9 +110,10 @@ def read_body(body: type[nov.Body], wire: struct.Struct, texts: list[str]) -> no
     codes = wire_codes(wire)
     if len(texts) < len(codes):
         raise FieldError("fields")
-    values = [_value(name, code, text) for name, code, text in zip(body._fields, codes, texts, strict=False)]
+    names: tuple[str, ...] = getattr(body, "_fields", ())
+    values = [_value(name, code, text) for name, code, text in zip(names, codes, texts, strict=False)]
     try:
-        return body._make(wire.unpack(wire.pack(*values)))
+        return body(*wire.unpack(wire.pack(*values)))
     except (struct.error, OverflowError):
         raise FieldError("range") from None
 
@@ -153,9 +157,7 @@ def encode_ascii(
         KeyError: no layout has that name.
     """
     layout = nov.LAYOUTS[nov.IDS[name]]
-    values: tuple[float | bytes, ...] = tuple(body)
-    fields = zip(body._fields, wire_codes(layout.wire), values, strict=True)
-    texts = [_text(field, code, value) for field, code, value in fields]
+    texts = field_texts(layout.body, layout.wire, tuple(body))
     seconds = f"{milliseconds / 1000:.3f}"
     if layout.short:
         head = f"{name}A,{week},{seconds}"
@@ -170,6 +172,12 @@ def seal(sync: bytes, text: str) -> bytes:
     digits = f"*{crc32_novatel(content):08x}".encode()
     assert len(digits) == NOVATEL_ASCII_TAIL_BYTES
     return sync + content + digits + b"\r\n"
+
+
+def field_texts(body: type, wire: struct.Struct, values: tuple[float | bytes, ...]) -> list[str]:
+    """Return the texts of a body's values."""
+    names: tuple[str, ...] = getattr(body, "_fields", ())
+    return [_text(name, code, value) for name, code, value in zip(names, wire_codes(wire), values, strict=True)]
 
 
 def _text(name: str, code: str, value: float | bytes) -> str:

@@ -35,12 +35,12 @@ from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import GNSS_KINDS
 from swath.drivers.gnss.date_floor import GPS_EPOCH, ReceiverDates, leap_seconds_of
 from swath.drivers.gnss.epochs import EpochGatherer
+from swath.drivers.gnss.nmea.beside import NmeaFixes
 from swath.drivers.gnss.record_rows import Row, join_rows
 from swath.drivers.gnss.ubx import messages as ubx
 from swath.drivers.gnss.ubx.fix import (
     POSITION_MESSAGES,
     NavMessage,
-    NmeaFixes,
     baseline_heading,
     ins_row,
     merge_epoch,
@@ -437,7 +437,7 @@ class UbxParser(StreamParser):
 
     def _add(self, host_time_ns: int, name: str, message: NavMessage) -> Items:
         if name in POSITION_MESSAGES and self._nmea is not None:
-            self._nmea.ubx_position()
+            self._nmea.own_position()
         return self._merged(self._epochs.add(message.itow_ms, name, (host_time_ns, message))) if self._gathers else []
 
     def _merged(self, epochs: list[dict[str, tuple[int, NavMessage]]]) -> Items:

@@ -14,9 +14,10 @@ from pyubx2.ubxtypes_core import UBX_MSGIDS
 
 from swath.drivers.framing.kinds import UBX_NAMES
 from swath.drivers.gnss.nmea import sentences as nmea
+from swath.drivers.gnss.nmea.beside import FORGET_AFTER_SENTENCES
 from swath.drivers.gnss.ubx import messages as ubx
 from swath.drivers.gnss.ubx import sensors
-from swath.drivers.gnss.ubx.fix import FORGET_AFTER_SENTENCES, geodetic_from_ecef
+from swath.drivers.gnss.ubx.fix import geodetic_from_ecef
 from swath.drivers.gnss.ubx.parser import UbxParser
 from swath.drivers.imu.ubx_esf import make_imu_parser
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
