@@ -285,7 +285,7 @@ SIDEWAYS = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]  # spin axis forw
 
 
 def vlp16_quanta(pulse: Int64Array, groups: int) -> FloatArray:
-    """Return how many quanta of azimuth a firing's azimuth is good to.
+    """Return the number of azimuth quanta to which a firing's azimuth is known.
 
     Between two groups of a packet it is interpolated: one. Behind the last group it goes on from the last two, a_n and
     a_n + t (a_n − a_n−1) for the share t of the time from group to group: 1 + 2t.

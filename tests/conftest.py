@@ -1,4 +1,4 @@
-"""What all processes of a test run share, workers and those that tests start: set before the first of them begins."""
+"""Prepares what all processes of a test run share, before the first of them begins."""
 
 from __future__ import annotations
 

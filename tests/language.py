@@ -36,9 +36,9 @@ VERBS = set(
     overwrite pack parse pass place plan play post predict prepare print process propagate provide put queue raise
     rank read receive recognise record redirect reduce refit refuse register release remove rename repair repeat
     replace replay reply report request restore return rotate run sample save say scale scan search select send
-    serve set shift show skip smooth solve sort split spread start steer step stop store style sum summarise switch
-    sync take tell terminate test thin transform truncate try turn unpack unplug update use validate view wait wake
-    warm watch whiten widen wire work wrap write yield
+    serve set shift show skip smooth solve sort split spread start steer step stop store style sum summarise
+    suppress switch sync take tell terminate test thin transform truncate try turn unpack unplug update use validate
+    view wait wake warm watch whiten widen wire work wrap write yield
 """.split()
 )
 

@@ -1,4 +1,4 @@
-"""Folders of tests that want more than a computer with Python: collected only when they are asked for by name."""
+"""Collects folders of tests that need more than a computer with Python only if they are named."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Runs the commands of docs/office.md in their order; can write into the page what they print.
+"""Runs the commands of docs/office.md in order, and can write their output into the page.
 
 python -m tests.office        writes the page's outputs anew
 """

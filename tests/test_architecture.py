@@ -1,4 +1,4 @@
-"""What the contracts of import-linter cannot say: names, lists, sizes and what lies in the checkout."""
+"""Tests architecture rules beyond import-linter's contracts: names, lists, sizes and files of the checkout."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The share of the processors that other programs had, which stands beside a failure in the virtual machine."""
+"""Tests the share of processors used by other programs, which is reported with a virtual machine's failure."""
 
 from __future__ import annotations
 

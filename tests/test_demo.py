@@ -1,4 +1,4 @@
-"""The demonstration itself, shortened: what `make demo` runs must pass, and its proof must be able to fail."""
+"""Tests the demonstration, shortened: what `make demo` runs must pass, and its proof must be able to fail."""
 
 from __future__ import annotations
 

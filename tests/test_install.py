@@ -1,4 +1,4 @@
-"""`make install` into a folder, what the installed program can do with nothing else around it, and `make uninstall`."""
+"""Tests `make install` into a folder, the installed program with nothing else around it, and `make uninstall`."""
 
 from __future__ import annotations
 
@@ -263,7 +263,7 @@ def root_before(tmp_path: Path) -> Path:
 
 
 def install_with(root: Path, prefix: str = "/opt/swath", venv: str = ":", pip: str = ":") -> tuple[int, str]:
-    """`install` with a Python that does as told; its exit status and all it said."""
+    """Run `install` with a Python that behaves as given, and return its exit status and all output."""
     python = root.parent / "python"
     python.write_text(PYTHON_OF_SCRIPTS.format(venv=venv, pip=pip))
     python.chmod(0o755)

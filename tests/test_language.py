@@ -1,4 +1,4 @@
-"""Docstrings and commit subjects are written as CONTRIBUTING.md asks, and the script that looks finds what is not."""
+"""Tests that docstrings and commit subjects are as CONTRIBUTING.md asks, and that the script finds others."""
 
 from __future__ import annotations
 

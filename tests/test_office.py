@@ -1,4 +1,4 @@
-"""The ten steps of docs/office.md: each command runs in its place, and prints what the page shows."""
+"""Tests the ten steps of docs/office.md: each command runs in its place and prints what the page shows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Swath beside what else is installed: packages of common names, scripts of common names, an earlier installation."""
+"""Tests Swath beside other packages and scripts with common names, and beside an earlier installation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every command and every configuration in README.md: run here, or checked by the test that the table names."""
+"""Tests every command and configuration in README.md, or names the test that does."""
 
 from __future__ import annotations
 

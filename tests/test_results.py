@@ -1,4 +1,4 @@
-"""The closing line of all runs: what it counts, and when it is a failure."""
+"""Tests the closing line of all runs: its counts, and when it is a failure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The unit and what is installed beside it, put before systemd's own checkers."""
+"""Tests the unit and the files installed with it by systemd's own checkers."""
 
 from __future__ import annotations
 

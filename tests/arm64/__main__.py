@@ -1,4 +1,4 @@
-"""Run the suite of `tests.arm64.suite`, by the emulated Python: ``python -m tests.arm64 [more for pytest]``."""
+"""Runs the suite of `tests.arm64.suite` with the emulated Python: ``python -m tests.arm64 [more for pytest]``."""
 
 from __future__ import annotations
 

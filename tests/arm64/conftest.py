@@ -1,4 +1,4 @@
-"""Tests on an emulated ARM64: only when asked for by name (``pytest tests/arm64``), as `make test-arm64` does."""
+"""Collects the tests on an emulated ARM64 only if named (``pytest tests/arm64``), as `make test-arm64` does."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One log on two processors, by the same commands: what is decoded, exported, repaired, georeferenced and navigated.
+"""Tests that decoding, export, repair, georeferencing and navigation give the same on two processors.
 
 Everything up to the points in e is the same to the last bit on a host that has FMA: numba joins no product and sum, and
 glibc's sine and cosine are made of the same operations then. Beyond stand PROJ, whose compiler does join them on ARM64

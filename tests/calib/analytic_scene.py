@@ -1,4 +1,4 @@
-"""Flights over ground given by a formula: beams of SciPy's rotations, met with the ground by bisection; no sim."""
+"""Makes flights over ground given by a formula, with SciPy's rotations and bisection, without the simulator."""
 
 from __future__ import annotations
 

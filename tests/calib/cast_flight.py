@@ -1,4 +1,4 @@
-"""Straight strips over a scene of the virtual aircraft, without a log: rays by CONVENTIONS' formula, truth beside."""
+"""Makes straight strips over a scene of the virtual aircraft, without a log, with their truth."""
 
 from __future__ import annotations
 

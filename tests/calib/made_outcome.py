@@ -1,4 +1,4 @@
-"""An outcome of a calibration made by hand: a flight over houses, and numbers as an adjustment would give them.
+"""Makes an outcome of a calibration by hand: a flight over houses, with numbers as of an adjustment.
 
 Nothing here is estimated: residuals are drawn, sigmas are said. It is what reports and records are tried on.
 """

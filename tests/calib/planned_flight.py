@@ -1,4 +1,4 @@
-"""A calibration flight without a log: level lines over roofs, each return where its beam meets one."""
+"""Makes a calibration flight without a log: level lines over roofs, each return where its beam meets one."""
 
 from __future__ import annotations
 

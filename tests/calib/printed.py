@@ -1,4 +1,4 @@
-"""The worked adjustment of FORMULAS 6.5: 25 planes, 8 lines, 1522 points, each with a pose of its own.
+"""Makes the worked adjustment of FORMULAS 6.5: 25 planes, 8 lines, 1522 points, each with its own pose.
 
 Its draws are made again in the same order; its geometry is written anew, for all points at once.
 """

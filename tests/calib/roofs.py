@@ -1,4 +1,4 @@
-"""A flight made by hand: straight lines over inclined planes, ranges by intersection, without the virtual aircraft.
+"""Makes a flight by hand: straight lines over inclined planes, with ranges by intersection.
 
 Its points are computed with scipy's rotations from CONVENTIONS' formulas, not with georef's.
 """

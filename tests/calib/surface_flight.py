@@ -1,4 +1,4 @@
-"""A flight made of nothing but given surfaces: swaths with points where a test wants them, no sensor behind them."""
+"""Makes a flight of given surfaces, with points where a test needs them and without a sensor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The adjustment: FORMULAS' worked numbers, a dense solution, true errors over many runs, and what it refuses."""
+"""Tests the adjustment: FORMULAS' worked numbers, a dense solution, true errors over many runs, refusals."""
 
 from __future__ import annotations
 

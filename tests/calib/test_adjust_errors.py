@@ -1,4 +1,4 @@
-"""The sigmas of an adjustment against its true errors, over many runs with correlated trajectory errors."""
+"""Tests an adjustment's sigmas against its true errors, over many runs with correlated trajectory errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The calibration file that is written is the one that is read."""
+"""Tests that the calibration file that is written is the one that is read."""
 
 from __future__ import annotations
 

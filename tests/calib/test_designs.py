@@ -1,4 +1,4 @@
-"""Sigmas of calibrations hold on flights of many designs, whatever is held and off by what is plausible of it."""
+"""Tests that sigmas of calibrations hold for many flight designs, with held parameters plausibly wrong."""
 
 from __future__ import annotations
 

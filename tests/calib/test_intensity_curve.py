@@ -1,4 +1,4 @@
-"""A curve through knots that turns only where they do: against scipy's, its derivatives against differences."""
+"""Tests the monotone curve through knots against SciPy's, and its derivatives against differences."""
 
 from __future__ import annotations
 

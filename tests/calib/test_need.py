@@ -1,4 +1,4 @@
-"""What a calibration leaves in points against draws of it, and what is wanted of it by height."""
+"""Tests the error that a calibration leaves in points against draws, and the accuracy needed by height."""
 
 from __future__ import annotations
 

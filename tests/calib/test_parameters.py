@@ -1,4 +1,4 @@
-"""Which parameters are estimated, and how they go back into calibrations."""
+"""Tests which parameters are estimated, and how they return into calibrations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A planned flight: its returns lie where georef puts them, and its predicted sigmas are those of adjusted noise."""
+"""Tests that returns of a planned flight lie where georef places them, and that predicted sigmas hold."""
 
 from __future__ import annotations
 

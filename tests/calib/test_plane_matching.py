@@ -1,4 +1,4 @@
-"""The same planes found again: stable where nothing moves, right where the points have moved."""
+"""Tests that planes are found again: stable where nothing moves, right where the points have moved."""
 
 from __future__ import annotations
 

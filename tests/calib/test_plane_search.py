@@ -1,4 +1,4 @@
-"""Planes that are found, against the scene they were flown over: what they are made of, and what is left out."""
+"""Tests the planes found against the scene of the flight: what they consist of, and what is left out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Coarse alignment, against the truth of virtual flights."""
+"""Tests coarse alignment against the truth of virtual flights."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report says what was found, in figures that are those of the input, and holds together without a network."""
+"""Tests that the report's figures are those of its input, and that it is complete without a network."""
 
 from __future__ import annotations
 
@@ -53,7 +53,10 @@ def page(report: ReportInput) -> str:
 
 
 def sound(report: ReportInput, **changes: Any) -> ReportInput:
-    """Remove the bad control point, the correlated pair and undetermined parameters; then apply changes."""
+    """Return the input of a report without its bad control point, correlated pair and undetermined parameters.
+
+    Then the changes are applied.
+    """
     adjusted = report.adjusted
     correlation = np.eye(len(adjusted.names))
     plain = replace(adjusted, control=adjusted.control[:4], correlation=correlation, held=())

@@ -1,4 +1,4 @@
-"""The maps of a calibration's report: coordinates, colours and words are measured as they are drawn."""
+"""Tests the maps of a calibration's report: coordinates, colours and words are measured as drawn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sizes of a flight, and what the plane search makes of them."""
+"""Tests the sizes of a flight, and the cells that the plane search derives from them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Strip adjustment: errors put into single strips are found in these, with the model that they have, and no others."""
+"""Tests that strip adjustment finds errors in the strips that have them, with their model, and in no others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small calibration flight over houses: flown by the virtual aircraft, and read as a calibration reads a log."""
+"""Flies a small calibration flight over houses with the virtual aircraft, and reads it as a calibration does."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`swath COMMAND` as a process of its own, forked from one that has loaded everything: a tenth of a fresh start's cost.
+"""Runs `swath COMMAND` as a process forked from one that has loaded everything, ten times faster than a start.
 
 For tests of what a command does; that it starts at all, and what it loads, is shown by those that start it afresh.
 """
@@ -141,7 +141,7 @@ def at_phase(phase: str, act: Callable[[], None]) -> None:
 
 
 def fill(folder: Path) -> None:
-    """Take all the room on a folder's disk."""
+    """Fill the disk of a folder."""
     with (folder / "others.bin").open("ab", buffering=0) as file, contextlib.suppress(OSError):
         while True:
             file.write(bytes(4096))

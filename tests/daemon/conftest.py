@@ -12,7 +12,7 @@ from swath.daemon.cli import progress
 
 @pytest.fixture(autouse=True)
 def quick_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let no command write lines of progress because this computer is slow; the tests of progress set their own."""
+    """Suppress lines of progress caused by a slow computer; the tests of progress set their own."""
     monkeypatch.setattr(progress, "AFTER_S", math.inf)
 
 

@@ -1,4 +1,4 @@
-"""A CAN adapter with switches, as a python-can interface of its own: ``can:faulty:<path of a socket>``.
+"""A CAN adapter with switches, which python-can loads as an interface: ``can:faulty:<path of a socket>``.
 
 Who holds the other end sends SocketCAN frames of 16 bytes, which the bus gives; anything else is what the adapter
 says of itself, and the bus raises it. A file ``<path>.off`` beside the socket: the adapter cannot be opened.

@@ -1,4 +1,4 @@
-"""Starts recorders by fork, all imports done: a hundred starts cost what one does. A line a recorder, its pid back."""
+"""Starts recorders by fork after all imports: reads a configuration per line, and prints the child's pid."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the service's journal says of events, for tests without a process."""
+"""Reads the events in the service's journal, for tests without a process."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is in a log, read twice: by our reader, and by the official one, which must agree on every message."""
+"""Reads a log twice, with our reader and the official one, which must agree on every message."""
 
 from __future__ import annotations
 

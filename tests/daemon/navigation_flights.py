@@ -1,4 +1,4 @@
-"""A navigated flight as it might come: the reference flight's truth, with errors of known size put in."""
+"""Makes a navigated flight from the reference flight's truth and errors of known size."""
 
 from __future__ import annotations
 

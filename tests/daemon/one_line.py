@@ -1,4 +1,4 @@
-"""A short flight without noise along one line, its log, and its truth as a trajectory's file, for tests of products."""
+"""Makes a short flight without noise along one line, with its log and its true trajectory as a file."""
 
 from __future__ import annotations
 

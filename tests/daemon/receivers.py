@@ -1,4 +1,4 @@
-"""Receivers at the far end of a pty or a UDP port that do as they are told, or do not."""
+"""Simulates receivers at the far end of a pty or a UDP port, obedient or not."""
 
 from __future__ import annotations
 

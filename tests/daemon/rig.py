@@ -1,4 +1,4 @@
-"""A recorder in its own process, and wires to send on: what every end-to-end test works with."""
+"""Runs a recorder in its own process, with wires to send on, for every end-to-end test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A flight of seconds over flat land with event marks, into a log: for tests of what navigation reads and makes."""
+"""Makes a log of a flight of seconds over flat land with event marks, for tests of navigation."""
 
 from __future__ import annotations
 

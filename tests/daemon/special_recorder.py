@@ -1,4 +1,4 @@
-"""``swath run`` with a small queue, or with a defect built in: python -m tests.daemon.special_recorder KIND CONFIG."""
+"""Runs ``swath run`` with a small queue or a built-in defect: python -m tests.daemon.special_recorder KIND CONFIG."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _defect(*unused: object) -> NoReturn:
 
 
 def main(kind: str, config: Path) -> int:
-    """Record; the defect shows once the recorder has been READY for a while."""
+    """Record with the defect, which shows once the recorder has been READY for a while."""
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     if kind == "broken-writer":
         whole = Account.statuses

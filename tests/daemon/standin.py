@@ -1,4 +1,4 @@
-"""A flight that is none: four devices spoken for by the drivers' encoders, for the tests of a flight's way out."""
+"""Stands in for a flight: four devices whose units come from the drivers' encoders."""
 
 from __future__ import annotations
 

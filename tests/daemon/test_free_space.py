@@ -1,4 +1,4 @@
-"""The space that a command needs, and the space that there is."""
+"""Tests the space that a command needs against the space on the disk."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from swath.daemon.free_space import check_space
 
 
 def with_free(monkeypatch: pytest.MonkeyPatch, free_bytes: int) -> None:
-    """Let every disk have so much space."""
+    """Let every disk have a given free space, bytes."""
     monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=free_bytes))
 
 

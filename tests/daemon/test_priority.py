@@ -1,4 +1,4 @@
-"""Commands that give way do so on every processor: the numbers of system calls differ between them."""
+"""Tests that commands lower their priority on every processor; the numbers of system calls differ."""
 
 from __future__ import annotations
 

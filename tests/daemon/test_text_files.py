@@ -1,4 +1,4 @@
-"""Text files that users name: encodings, and what is none."""
+"""Tests text files that users name: encodings, and files that are no text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Devices that say the same again and again: a serial port, a sender of datagrams."""
+"""Simulates devices that repeat themselves: a serial port, a sender of datagrams, a TCP server."""
 
 from __future__ import annotations
 

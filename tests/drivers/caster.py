@@ -1,4 +1,4 @@
-"""An NTRIP caster for tests: a real TCP server that says what it is told to, and keeps what it was asked."""
+"""Serves an NTRIP caster for tests: a TCP server that sends what a script says and keeps the requests."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def caster(script: Script) -> Iterator[Caster]:
 
 
 def listen(found: Caster, sock: socket.socket, seconds: float) -> None:
-    """Keep what a client says, until it hangs up or the time is over."""
+    """Keep what a client sends until it hangs up or the time is over."""
     sock.settimeout(seconds)
     with contextlib.suppress(TimeoutError):
         while data := sock.recv(4096):

@@ -1,4 +1,4 @@
-"""SocketCAN on a kernel that has it; run by name, as root, in a virtual machine: `pytest tests/drivers/guest_can.py`.
+"""Tests SocketCAN in a virtual machine whose kernel has it, as root: `pytest tests/drivers/guest_can.py`.
 
 Wants the modules vcan and can_raw loaded; for the last test can0 and can1 on one bus (two emulated kvaser_pci:
 qemu's ``-object can-bus,id=cb -device kvaser_pci,canbus=cb``, twice).

@@ -1,4 +1,4 @@
-"""PPS on DCD beside data on one 16550; run by name, as root, in a virtual machine: pytest tests/drivers/guest_dcd.py
+"""Tests PPS on DCD beside data on one 16550 in a virtual machine, as root: pytest tests/drivers/guest_dcd.py
 
 Wants /dev/ttyS1 with a pulse of 0.1 s on DCD each second and NMEA at 38400 baud.
 """

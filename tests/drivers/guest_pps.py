@@ -1,4 +1,4 @@
-"""Kernel PPS on a real /dev/pps0; run by name, as root, in a virtual machine: `pytest tests/drivers/guest_pps.py`.
+"""Tests kernel PPS on a real /dev/pps0 in a virtual machine, as root: `pytest tests/drivers/guest_pps.py`.
 
 Wants pps_sim.ko loaded: a pulse on each second of CLOCK_REALTIME, with the parameters on and drop.
 """

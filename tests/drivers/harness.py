@@ -1,4 +1,4 @@
-"""What every parser is put through on a real recording: cut anywhere, byte by byte, damaged; the same truth each time.
+"""Checks every parser on a real recording: cut anywhere, byte by byte, damaged, with the same result each time.
 
 Streams (`check_stream`, `check_damage`): units end anywhere, so the same bytes give the same records and counters
 however they are cut. Packets (`check_packets`, `check_packet_damage`): units are whole, only batches vary.
@@ -207,7 +207,7 @@ class _Shared(pickle.Unpickler):
 
 
 def check_cuts(make: Factory, data: bytes, positions: Iterable[int], ends: Sequence[int] = ()) -> None:
-    """Cut in two at each position: same records and counters up to well behind the cut, tail released.
+    """Check that cutting in two at each position gives the same records and counters.
 
     A parser that has taken everything up to a checkpoint is copied, so that a cut costs the bytes around it only;
     ``ends`` are those of messages, in order, behind which less will do.
@@ -402,7 +402,7 @@ def run_packets(make: Factory, units: Sequence[bytes], largest: Callable[[], int
 
 
 def run_together(make: Factory, units: Sequence[bytes], some: Callable[[], int]) -> Outcome:
-    """Run the same with batches of different lengths in ``some()`` batches at once."""
+    """Feed several of the batches, which have different lengths, at once; `some` draws how many."""
     parser = make()
     records: list[Record] = []
     batches = iter(packet_batches(units, some))

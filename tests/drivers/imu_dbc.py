@@ -1,4 +1,4 @@
-"""A small DBC of an inertial unit and frames for it, for the tests of the CAN drivers."""
+"""Provides a small DBC of an inertial unit and frames for it, for the tests of the CAN drivers."""
 
 from __future__ import annotations
 
@@ -76,12 +76,12 @@ def gyr_frame(x: int, y: int = 0, z: int = 0) -> bytes:
 
 
 def sample_frame(ticks: int, temperature: int = 250) -> bytes:
-    """SAMPLE with the counter."""
+    """Return the frame SAMPLE with the counter."""
     return encode_can_frame(SAMPLE, struct.pack("<IhH", ticks & 0xFFFF_FFFF, temperature, 0))
 
 
 def sync_frame(ticks: int) -> bytes:
-    """SYNC with the latched counter."""
+    """Return the frame SYNC with the latched counter."""
     return encode_can_frame(SYNC, struct.pack("<I", ticks & 0xFFFF_FFFF))
 
 

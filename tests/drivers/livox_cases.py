@@ -1,4 +1,4 @@
-"""Packets of Livox heads made by Swath's encoder: a rosette before a wall, in every type of points and of time."""
+"""Makes packets of Livox heads with Swath's encoder: a rosette before a wall, in every type of point and time."""
 
 from __future__ import annotations
 

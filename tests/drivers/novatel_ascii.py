@@ -1,4 +1,4 @@
-"""NovAtel's own decoder's output (novatel-edie, ASCII logs), read for comparison; and the recordings beside it."""
+"""Reads the output of NovAtel's own decoder (novatel-edie, ASCII logs) and its recordings for comparison."""
 
 from __future__ import annotations
 

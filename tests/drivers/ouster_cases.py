@@ -1,4 +1,4 @@
-"""Ouster's fixtures, and heads of any profile for the tests that send packets themselves."""
+"""Provides Ouster's fixtures, and heads of any profile for tests that send packets themselves."""
 
 from __future__ import annotations
 

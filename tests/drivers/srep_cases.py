@@ -1,4 +1,4 @@
-"""SREP for tests: the page's test vector, a flight line's worth of datagrams, and a decoder written from the page.
+"""Makes SREP for tests: the page's test vector, datagrams of a flight line, and a decoder written from the page.
 
 The decoder goes pulse by pulse with `struct` and whole numbers of any size; it shares nothing with the driver.
 """

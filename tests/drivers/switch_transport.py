@@ -1,4 +1,4 @@
-"""A transport with switches that make it fail, for what is built on transports."""
+"""Provides a transport with switches that make it fail, for tests of what is built on transports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every driver there is, found by what it declares: it has recordings, and random bytes do not raise in it.
+"""Tests every driver, found by its declaration: it has recordings, and random bytes never raise in it.
 
 A driver's recordings lie in ``fixtures/<protocol>/`` or in that of its family, the protocol's name up to a hyphen
 (``velodyne-vlp16`` in ``fixtures/velodyne/``), with a SOURCE.md that says where they come from.
@@ -139,7 +139,7 @@ def test_error_for_an_unknown_protocol_names_the_probable_one(kind: DeviceKind, 
 
 
 def make_and_feed(parser: Parser, units: list[bytes]) -> None:
-    """Feed one by one and as batches, then close; every byte is counted."""
+    """Feed one by one and as batches, then close, and check that every byte is counted."""
     for index, unit in enumerate(units):
         parser.feed(Chunk("test/test", index, unit))
     for index, unit in enumerate(units):

@@ -1,5 +1,4 @@
-"""Every recording of the collection that the fixtures are taken from: its copy is here, and its driver reads in it
-what ``EXPECTED.json`` says that others did. Values are compared in the tests of each driver."""
+"""Tests that each recording of the collection is here, and that its driver reads what others read in it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The session's states, with time and device under the test's hand."""
+"""Tests the session's states, with time and device controlled by the test."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Start-up messages: what they are by pyubx2 and by the makers' documents, and answers found in what devices send."""
+"""Tests start-up messages by pyubx2 and the makers' documents, and answers found in devices' data."""
 
 from __future__ import annotations
 

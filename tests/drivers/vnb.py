@@ -1,4 +1,4 @@
-"""VectorNav recordings of the program INSTINCT (.vnb) as the messages that the unit sent.
+"""Converts VectorNav recordings of the program INSTINCT (.vnb) into the messages that the unit sent.
 
 A .vnb file begins with the field masks of six groups (time, IMU, GNSS1, attitude, INS, GNSS2; u32 each). A record is
 INSTINCT's own time (i32, i32, f64) and the fields as the unit sent them, but for one padding byte in the heads of the

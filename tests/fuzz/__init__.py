@@ -1,4 +1,4 @@
-"""Inputs nobody would send: everything that reads bytes of others is run on what a seed and a mutation make.
+"""Feeds improbable inputs, made from a seed and a mutation, to everything that reads foreign bytes.
 
 `parsers` (every driver, found by what it declares), `logs` (reader and recovery), `files` (captures, configuration),
 `followed` (a log that grows, and its sign), `exports` (a log as other people's files, and back), `asked` (operators,

@@ -1,4 +1,4 @@
-"""``python -m tests.fuzz``: every target for so long; an input that breaks one is made small and kept in fuzz/crashes.
+"""Runs every fuzzing target for a time; an input that breaks one is minimised and kept in fuzz/crashes.
 
 Hypothesis chooses the inputs; with ``--guided`` libFuzzer does, by the code they reach, through atheris (Linux on
 x86-64; ``pip install atheris``), and what it learns stays under fuzz/corpus. ``--input FILE`` runs one input again.

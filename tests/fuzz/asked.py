@@ -1,4 +1,4 @@
-"""What is said when somebody asks: an operator of the recorder, the recorder in return, a caster, a device's set-up."""
+"""Targets for answers: an operator to the recorder, the recorder to an operator, a caster, a device's set-up."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that a device's table names: a head's geometry as its maker delivers it, an inertial unit's DBC."""
+"""Targets for files that a device's table names: a head's geometry, an inertial unit's DBC."""
 
 from __future__ import annotations
 

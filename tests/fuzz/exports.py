@@ -1,4 +1,4 @@
-"""A log as other people's files and back: the manifest, what stands beside files, edges, time tags, checksums."""
+"""Targets for exported logs: the manifest, sidecars, edges, time tags, checksums."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Captures and configurations as targets: files that others made, refused in one line or read."""
+"""Targets for captures and configurations: foreign files are read or refused in one line."""
 
 from __future__ import annotations
 

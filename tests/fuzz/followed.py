@@ -1,4 +1,4 @@
-"""A log while it grows: the sign that says which file it is, and who follows it; the index of one that is done."""
+"""Targets for a growing log: the sign that names the file, its followers, and the index of a finished log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames with another content and a good checksum: what a checksum guards is decoded only behind it."""
+"""Changes frames and makes their checksums right, because decoders read only what a checksum guards."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The log's readers as a target: a stranger's file is read, counted, replayed and recovered, or refused in a line."""
+"""Targets for the log's readers: a foreign file is read, counted, replayed and recovered, or refused in a line."""
 
 from __future__ import annotations
 

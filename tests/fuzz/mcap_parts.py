@@ -1,4 +1,4 @@
-"""An MCAP file taken apart and put together again with whatever content, all lengths and checksums made right."""
+"""Splits an MCAP file and reassembles it with any content, with right lengths and checksums."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Damage to bytes: what breaks decoders is mostly a number at its bound, so those are laid over fields."""
+"""Damages bytes: numbers at their limits break most decoders, so these are laid over fields."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""What surveyors bring to the office's commands as text: control, picked points, polygons, times of strips,
-calibrations, what they tell for a record, records, plans.
-"""
+"""Targets for surveyors' text files: control, picked points, polygons, strip times, calibrations, facts, plans."""
 
 from __future__ import annotations
 

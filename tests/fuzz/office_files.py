@@ -1,4 +1,4 @@
-"""What comes to the office as trajectories, positions of an antenna, and points with what lies beside them."""
+"""Targets for trajectories, antenna positions, and points with their sidecars."""
 
 from __future__ import annotations
 

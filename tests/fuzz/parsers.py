@@ -1,4 +1,4 @@
-"""Every driver as a target: never raises, accounts for every byte, gives the same however its input is cut."""
+"""Targets for every driver: it never raises, accounts for every byte, and does not depend on how input is cut."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""GeoTIFFs that a user brings: the coarse terrain of ``[mta]``, the ground of a simulated flight."""
+"""Targets for a user's GeoTIFFs: the coarse terrain of ``[mta]``, and the ground of a simulated flight."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def _changed(rng: random.Random, base: bytes) -> bytes:
 
 
 def _terrain(data: bytes) -> Iterator[str]:
-    """Read, then asked as a stream of points asks it."""
+    """Read the terrain, and yield what a stream of points would get from it."""
 
     def read() -> Iterator[str]:
         terrain = read_terrain(path)

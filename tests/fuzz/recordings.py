@@ -1,4 +1,4 @@
-"""What a driver is made with and what its device has sent, found by its page and its folder in fixtures/.
+"""Finds a driver's settings and its device's recordings by its page and its folder in fixtures/.
 
 The settings are those of the example on ``docs/devices/<protocol>.md``; a file they name is taken by its name, else by
 its suffix, from the driver's fixtures.

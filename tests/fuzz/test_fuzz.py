@@ -1,4 +1,4 @@
-"""Run every target for a short time, the same each time; ``make fuzz`` is the long run.
+"""Runs every target for a short time, the same each time; ``make fuzz`` is the long run.
 
 The harness itself is tested too: sealed frames are good ones, and planted defects are found.
 """

@@ -1,4 +1,4 @@
-"""Texts as inputs: a word replaced by one that readers stumble over, lines doubled, left out, damaged."""
+"""Changes texts: a word is replaced by one that troubles readers, lines are doubled, removed or damaged."""
 
 from __future__ import annotations
 

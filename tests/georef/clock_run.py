@@ -1,4 +1,4 @@
-"""Runs a simulated clock through PpsClock second by second and compares what it says with the truth."""
+"""Runs a simulated clock through PpsClock second by second, and compares its claims with the truth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A simulated oscillator, receiver and wire: what a host sees of PPS edges and time messages, and the truth beside it.
+"""Simulates an oscillator, receiver and wire: PPS edges and time messages as a host sees them, and the truth.
 
 Shares no code with swath.georef.timescales: it counts seconds itself, from calendar arithmetic of the standard
 library, and keeps the host's clock as an integral of its frequency. Everything random comes from one seed.

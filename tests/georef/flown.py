@@ -1,4 +1,4 @@
-"""A flight in closed form, for files of trajectories: its velocities are the derivatives of its positions."""
+"""Makes a flight in closed form, for trajectory files: its velocities are the derivatives of its positions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scanners of every type, and where their beams go by other means than georef's: half turns, SciPy, drivers."""
+"""Provides scanners of every type, with beams computed independently: half turns, SciPy, drivers."""
 
 from __future__ import annotations
 

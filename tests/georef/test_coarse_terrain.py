@@ -1,4 +1,4 @@
-"""The coarse terrain model: heights by SciPy, beams that end where they were aimed."""
+"""Tests the coarse terrain model: heights by SciPy, and beams that end where they were aimed."""
 
 from __future__ import annotations
 

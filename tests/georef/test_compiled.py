@@ -1,4 +1,4 @@
-"""Compiled loops are jit_cached between processes, and never outlive the text they were made of."""
+"""Tests that compiled loops are cached between processes, and never outlive their source text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole way from returns to the map: the steps in their order, in blocks, and what becomes of every row."""
+"""Tests the whole way from returns to the map: the steps in order, in blocks, and the fate of every row."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ SIDEWAYS = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])  # it s
 
 
 def scan_angles(geometry: Geometry, installation: FloatArray, roll_rad: float, readings_rad: list[float]) -> FloatArray:
-    """Scan angles of points, degrees, of an aircraft that flies to the south-east, nose up."""
+    """Return scan angles of points, degrees, of an aircraft that flies south-east with its nose up."""
     n = len(readings_rad)
     time_ns = 10 * MS * np.arange(3, dtype=np.int64)
     lat_rad, same = 0.82 - 1e-7 * np.arange(3), np.ones(3)

@@ -1,4 +1,4 @@
-"""Strips side by side have different colours, for colour-blind readers too."""
+"""Tests that strips side by side have different colours, for colour-blind readers too."""
 
 from __future__ import annotations
 

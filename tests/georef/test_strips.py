@@ -1,4 +1,4 @@
-"""Strips from turns and from the laser, against flights drawn by hand."""
+"""Tests strips from turns and from the laser, against flights drawn by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""TOML as tables: what is read as it stands, and what is refused in a line that names the place."""
+"""Tests TOML as tables: what is accepted, and refusals in a line that names the place."""
 
 from __future__ import annotations
 

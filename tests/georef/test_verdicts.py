@@ -1,4 +1,4 @@
-"""Verdicts: limits, their levels, and the order of reasons."""
+"""Tests verdicts: limits, their levels, and the order of reasons."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A receiver's time beside the computer's clock: time zones, old dates, and what says nothing."""
+"""Tests a receiver's time against the computer's clock: time zones, old dates, and cases without a finding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stands before the real one for every process that the tests start.
+"""Replaces the real asammdf in every process that the tests start.
 
 python-can imports asammdf wherever it is installed, and pandas with it: a second at each start, for a format of files
 that Swath does not read. An aircraft's computer does not have it; one test asks for the real one.

@@ -1,1 +1,1 @@
-"""Programs of others beside ours: gpsd, and the reader that Foxglove's viewer is built on. ``make test-peers``."""
+"""Tests beside other programs: gpsd, and the reader of Foxglove's viewer (``make test-peers``)."""

@@ -1,4 +1,4 @@
-"""``live.mcap`` in the reader that Foxglove's viewer is built on (@mcap/core), with Foxglove's published schemas."""
+"""Tests ``live.mcap`` with the reader of Foxglove's viewer (@mcap/core) and Foxglove's published schemas."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""gpsd on a pseudo-terminal that ``swath replay`` plays a recording to: both say the same of every epoch.
+"""Tests that gpsd, fed by ``swath replay`` through a pseudo-terminal, agrees on every epoch.
 
 gpsd decodes by its own code. Compared are what it tells its clients (TPV) and what our decoders say, to the last
 digit that the receiver's message or gpsd's JSON holds, whichever is coarser.

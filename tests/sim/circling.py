@@ -1,4 +1,4 @@
-"""A body that circles, climbs and banks by closed forms, and what stands on its own where it is: no code of `sim`."""
+"""Provides a body that circles, climbs and banks in closed form, without code of the simulator."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small direct implementation of ISO/TS 19159-2 Eq. 10 with CONVENTIONS' model, by pyproj and SciPy only.
+"""Computes ISO/TS 19159-2 Eq. 10 with the model of the conventions directly, by pyproj and SciPy only.
 
 It takes what a scanner's packets say, the true calibration as a file says it and the true trajectory at the IMU's
 rate, and gives ground points: the check that the virtual aircraft means what CONVENTIONS says. It shares no line with

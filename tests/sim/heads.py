@@ -1,4 +1,4 @@
-"""Spinning heads without an aircraft: plans, random echoes with their truth, and decoding by this project's parsers."""
+"""Provides spinning heads without an aircraft: plans, random echoes with their truth, and decoding."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trajectories with closed forms, for tests of what is measured on them."""
+"""Provides trajectories in closed form, for tests of what is measured on them."""
 
 from __future__ import annotations
 

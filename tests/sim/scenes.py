@@ -1,4 +1,4 @@
-"""Small scenes for tests, and rays towards places on them."""
+"""Provides small scenes for tests, and rays towards places on them."""
 
 from __future__ import annotations
 

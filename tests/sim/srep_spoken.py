@@ -1,4 +1,4 @@
-"""A line scanner that fires and speaks SREP, for tests: returns made up from pulse numbers, no scene."""
+"""Provides a line scanner that sends SREP, for tests: returns made from pulse numbers, without a scene."""
 
 from __future__ import annotations
 

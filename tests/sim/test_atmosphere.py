@@ -1,4 +1,4 @@
-"""The air: Ciddor's published values, closed forms of the formula sheet, rays traced by another integrator."""
+"""Tests the air: Ciddor's published values, closed forms of the formula sheet, and another ray integrator."""
 
 from __future__ import annotations
 

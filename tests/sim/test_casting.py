@@ -1,4 +1,4 @@
-"""Ray casting against closed forms, scipy's root finder and triangles cut independently."""
+"""Tests ray casting against closed forms, SciPy's root finder and independent triangles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Oscillators, the pulse per second, and randomness that belongs to a name."""
+"""Tests oscillators, the pulse per second, and randomness that belongs to a name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Faults on demand: what each does to a source's units, and what makes no sense is refused."""
+"""Tests faults on demand: the effect of each on a source's units, and refusals of contradictory ones."""
 
 from __future__ import annotations
 

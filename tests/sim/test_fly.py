@@ -1,4 +1,4 @@
-"""Whole flights: the same seed gives the same bytes, sources come in order, faults and truth are where they belong."""
+"""Tests whole flights: a seed always gives the same bytes, in order, with faults and truth in place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The virtual aircraft's chain from beam to ground against the formula sheet's numbers (FORMULAS 2.1 and 5.2).
+"""Tests the virtual aircraft's chain from beam to ground by the formula sheet (FORMULAS 2.1 and 5.2).
 
 The columns of 5.2 are taken by differences of the whole chain; their step is far above rounding and far below what
 curvature would show in the digits compared.

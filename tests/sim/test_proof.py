@@ -1,4 +1,4 @@
-"""The proof: noiseless packets, decoded by the drivers and georeferenced by `tests.sim.direct`, hit the true points.
+"""Tests that noiseless packets, decoded by the drivers and placed by `tests.sim.direct`, hit the true points.
 
 The bound of each return is 1 mm and half the packet's own quanta carried to the ground: of range, angle and time.
 """

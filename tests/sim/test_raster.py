@@ -1,4 +1,4 @@
-"""Ground from GeoTIFFs, and rasters that cannot be used."""
+"""Tests ground from GeoTIFFs, and rasters that cannot be used."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The site frame against PROJ and against the ellipsoid's own formulas (FORMULAS 1.2, 1.3)."""
+"""Tests the site frame against PROJ and the ellipsoid's formulas (FORMULAS 1.2, 1.3)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SREP with apparent ranges: a reader written from the page finds every echo's own pulse, across datagrams."""
+"""Tests SREP with apparent ranges: a reader written from the page finds every echo's own pulse."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Truth files of any length."""
+"""Tests truth files of any length."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What runs inside the machine: recorder, network interfaces, senders. The host's half is `tests.vm.crew`.
+"""Runs inside the machine: recorder, network interfaces, senders. The host's half is `tests.vm.crew`.
 
 It imports little: where the processor is emulated, pytest alone takes longer to load than the machine to boot.
 """

@@ -1,4 +1,4 @@
-"""In the machine: an IMU on CAN, a sender by raw AF_CAN sockets, and what can befall an interface or a controller."""
+"""Runs in the machine: an IMU on CAN, a sender by raw AF_CAN sockets, faults of interface and controller."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Bus:
 
 
 def sample_frames(number: int, period_us: int) -> list[bytes]:
-    """Sample ``number`` of the unit of fixtures/config/imu.dbc; its axes say the number again."""
+    """Return sample ``number`` of the unit of fixtures/config/imu.dbc, whose axes repeat the number."""
     low, high = number & 0x7FFF, number >> 15
     contents = [
         (257, struct.pack("<hhh", low, high, 1962)),

@@ -1,4 +1,4 @@
-"""In the machine: a scanner's datagrams at the highest rate that is recorded here, and a recorder that stands still."""
+"""Runs in the machine: a scanner's datagrams at the highest rate recorded here, and a stalled recorder."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Scanner:
         self.sent = 0
 
     def send(self, rate_hz: int, seconds: float) -> bool:
-        """Send in real time, in bursts of up to 10 ms; whether the pace was held."""
+        """Send in real time, in bursts of up to 10 ms, and return whether the pace was held."""
         count, begin_s = round(rate_hz * seconds), time.monotonic()
         for number in range(count):
             left_s = begin_s + number / rate_hz - time.monotonic()
@@ -52,7 +52,7 @@ def _socket_row() -> list[str]:
 
 
 def drained() -> int:
-    """Wait until the recorder has taken everything; what the kernel dropped at its socket."""
+    """Wait until the recorder has read everything, and return how many units the kernel dropped at its socket."""
     wait_until(lambda: _socket_row()[4].endswith(":00000000"), "an empty queue")
     return int(_socket_row()[12])
 

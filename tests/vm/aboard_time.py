@@ -1,4 +1,4 @@
-"""In the machine: a GNSS receiver that names the seconds of a PPS, and what befalls the edges and the wall clock."""
+"""Runs in the machine: a GNSS receiver that names the seconds of a PPS, and faults of edges and wall clock."""
 
 from __future__ import annotations
 

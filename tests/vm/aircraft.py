@@ -1,4 +1,4 @@
-"""The aircraft computer of these proofs: its configuration, and what its sensors sent against what its logs hold."""
+"""Provides the aircraft computer of these proofs: its configuration, and a comparison of sent and logged units."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much of this computer others had meanwhile: the proofs want one that has nothing else to do."""
+"""Measures how much of this computer other programs used, because the proofs need an idle one."""
 
 from __future__ import annotations
 

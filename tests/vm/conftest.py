@@ -1,4 +1,4 @@
-"""Tests in a virtual machine: only when they are asked for by name (``pytest tests/vm``), as `make test-vm` does."""
+"""Collects the tests in a virtual machine only if named (``pytest tests/vm``), as `make test-vm` does."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The host's half of the tests in a virtual machine: programs of this package in it, and what they leave."""
+"""Runs programs of this package in a virtual machine, from the host, and reads what they leave."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The program as `make install` installs it, to lay over the machine's root: a folder and its disk, kept in .cache."""
+"""Makes the program as `make install` installs it, to lay over the machine's root; it is kept in .cache."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A small virtual machine for the tests: the host's root read-only under a tmpfs, one command, its status.
+"""Runs a small virtual machine: the host's root read-only under a tmpfs, one command, its status.
 
 `run` boots it, waits for the command and hands its status and words back; `start` leaves it running, so that a test may
 talk to it or cut its power. `/vm` in the machine is the folder ``shared`` of the host; the project's tree lies where it

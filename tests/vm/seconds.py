@@ -1,4 +1,4 @@
-"""What time the recorder thought it was: its own time keeping once more, over what it logged, in the order it came."""
+"""Repeats the recorder's time keeping over what it logged, in order of arrival."""
 
 from __future__ import annotations
 

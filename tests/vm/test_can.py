@@ -1,4 +1,4 @@
-"""SocketCAN: real vcan, two emulated controllers, and one whose errors are steered."""
+"""Tests SocketCAN: real vcan, two emulated controllers, and one whose errors are controlled."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The wall clock in flight: stepped by an hour, slewed, and with a leap second that the kernel inserts."""
+"""Tests the wall clock in flight: stepped by an hour, slewed, and with a leap second inserted by the kernel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The flight: the virtual aircraft on this computer, the aircraft's computer in the machine, wires between them.
+"""Tests a flight with the virtual aircraft on this computer and the aircraft's computer in the machine.
 
 Its scanner's datagrams come over the machine's network card, its receiver's messages over a 16550, its IMU's frames
 over SocketCAN, its pulses at /dev/pps0. qemu has no CAN but what the host's kernel has, so that frames cross as a

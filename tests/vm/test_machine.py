@@ -1,4 +1,4 @@
-"""The machine itself: what the other tests rely on."""
+"""Tests the machine itself, on which the other tests rely."""
 
 from __future__ import annotations
 

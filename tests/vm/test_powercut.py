@@ -1,4 +1,4 @@
-"""The power is cut while a full sensor set is recorded; what was durable is there, and little more than that is lost.
+"""Tests power cuts while a full sensor set is recorded: durable data are there, and little more is lost.
 
 The machine keeps time of its own: when what was sent, and when the kernel said what is on the disk, is written down
 in it, on the host, which the cut spares. The recording is that of the installed service, from its start at boot.

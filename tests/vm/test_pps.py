@@ -1,4 +1,4 @@
-"""PPS of the kernel: simulated edges that go wrong, and a receiver at a real 16550 with its pulse on DCD."""
+"""Tests PPS of the kernel: simulated faulty edges, and a receiver at a real 16550 with its pulse on DCD."""
 
 from __future__ import annotations
 

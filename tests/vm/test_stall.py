@@ -1,4 +1,4 @@
-"""The recorder stands still for half a second: its installed settings hold that, the kernel's default is counted."""
+"""Tests a recorder that stalls for half a second: installed settings lose nothing, the default is counted."""
 
 from __future__ import annotations
 

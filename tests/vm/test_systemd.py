@@ -1,4 +1,4 @@
-"""The installed service under a real systemd: one machine from start to shutdown, each promise on the way."""
+"""Tests the installed service under a real systemd: one machine from start to shutdown, each promise in turn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Control: the planes it lies on, and what speaks against it."""
+"""Tests control: on which planes it lies, and which objections to it are found."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Inverses of matrices of mixed units, against numpy's; the trajectory's prior and variances, turned between frames."""
+"""Tests inverses of matrices of mixed units against NumPy's, and covariances rotated between frames."""
 
 from __future__ import annotations
 

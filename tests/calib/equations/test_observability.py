@@ -1,4 +1,4 @@
-"""What is determined: the table of FORMULAS 5.5 from a design of georef's model, and normal matrices made by hand."""
+"""Tests which parameters are determined, by the table of FORMULAS 5.5 and normal matrices made by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Profiles beside an adjustment: what moves them, and sigmas that hold when the trajectory's errors change in time."""
+"""Tests profiles beside an adjustment: what moves them, and sigmas with trajectory errors that change in time."""
 
 from __future__ import annotations
 

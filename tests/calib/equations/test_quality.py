@@ -1,4 +1,4 @@
-"""Redundancy, tests and groups: against a dense solution and printed values."""
+"""Tests redundancy, statistical tests and groups against a dense solution and printed values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows of the design: against georef's own columns, and against differences of the model itself."""
+"""Tests rows of the design against georef's own columns and differences of the model."""
 
 from __future__ import annotations
 

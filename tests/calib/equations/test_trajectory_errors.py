@@ -1,4 +1,4 @@
-"""Trajectory errors beforehand: against dense least squares, navigated flights and processes written out."""
+"""Tests the prior of trajectory errors against dense least squares, navigated flights and explicit processes."""
 
 from __future__ import annotations
 

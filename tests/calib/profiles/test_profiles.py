@@ -1,4 +1,4 @@
-"""Profiles: the lecture's numbers and signs, angles put in one at a time, and sigmas that hold what they say."""
+"""Tests profiles: the lecture's numbers and signs, angles changed one at a time, and honest sigmas."""
 
 from __future__ import annotations
 

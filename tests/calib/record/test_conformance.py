@@ -1,4 +1,4 @@
-"""What the record's page says of conformance: of attributes that there are, tests that there are, and truly."""
+"""Tests that the record's page on conformance names existing attributes and tests, and is true."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The record holds what the dictionary asks for, or says that it is missing; and says the same twice."""
+"""Tests that the record has what the dictionary requires, or lists it as missing, and is reproducible."""
 
 from __future__ import annotations
 

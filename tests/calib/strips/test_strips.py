@@ -1,4 +1,4 @@
-"""Residual strip errors: point to plane against independent arithmetic and FORMULAS' printed numbers; verdicts."""
+"""Tests residual strip errors against independent arithmetic and FORMULAS' printed numbers, and verdicts."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_strip_differences_match_the_printed_numbers() -> None:
 
 
 def _width_m(points: FloatArray) -> float:
-    """Spread (one sigma) of a patch across its longest direction."""
+    """Return the spread (one sigma), m, of a patch across its longest direction."""
     return float(np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]) / math.sqrt(len(points))
 
 

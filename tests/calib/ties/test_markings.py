@@ -1,4 +1,4 @@
-"""Markings: shifts of images between swaths, their covariance, and what is refused, over known displacements."""
+"""Tests markings: shifts of images between swaths over known displacements, covariances and refusals."""
 
 from __future__ import annotations
 

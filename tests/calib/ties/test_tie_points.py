@@ -1,4 +1,4 @@
-"""Tie points: intersections of planes with the covariance a Monte Carlo shows, and points of a file."""
+"""Tests tie points: intersections of planes with the covariance of a Monte Carlo run, and points of a file."""
 
 from __future__ import annotations
 

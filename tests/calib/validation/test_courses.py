@@ -1,4 +1,4 @@
-"""The course of parameters through calibrations: constant, drifting, jumping, and after a new mounting."""
+"""Tests the course of parameters through calibrations: constant, drifting, jumping, and after a new mounting."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Histories of calibrations: what counts as a move, with correlations; a slow drift; files that are no history."""
+"""Tests histories of calibrations: significant moves with correlations, slow drifts, and unusable files."""
 
 from __future__ import annotations
 

@@ -73,7 +73,10 @@ def control(made: Cast) -> list[ControlPoint]:
 def methods(
     made: Cast, roofs: Features, control: list[ControlPoint] | None = None, **wrong: float
 ) -> dict[str, Method]:
-    """Return by name the methods of a validation of a calibration that is wrong by so much and does not know it."""
+    """Return by name the methods of a validation of a calibration that is wrong by the given amounts.
+
+    The calibration's sigmas do not include these errors.
+    """
     calibrations = {"left": made.truth.changed(**wrong)}
     found = validate(made.flight.placed(calibrations), roofs, calibrations, Asked(control))
     assert [method.name for method in found.methods] == list(CODES)

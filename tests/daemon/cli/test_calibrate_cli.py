@@ -1,4 +1,4 @@
-"""``swath calibrate`` from logs to files: the truth within its sigmas, and mistakes in one line."""
+"""Tests ``swath calibrate`` from logs to files: the truth within its sigmas, and mistakes in one line."""
 
 from __future__ import annotations
 

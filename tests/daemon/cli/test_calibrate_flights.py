@@ -1,4 +1,4 @@
-"""``swath calibrate`` on whole virtual flights: more parameters than the boresight, and two scanners at once."""
+"""Tests ``swath calibrate`` on whole virtual flights: more parameters than the boresight, and two scanners."""
 
 from __future__ import annotations
 

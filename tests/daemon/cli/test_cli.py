@@ -1,4 +1,4 @@
-"""The command line as a user and a script see it: help, one-line errors, exit codes; real processes throughout."""
+"""Tests the command line as users and scripts see it, in real processes: help, one-line errors, exit codes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pulses in air through ``swath georef``: a log of apparent ranges, SREP's byte 15 = 255, cut into two strips."""
+"""Tests pulses in air with ``swath georef``: a log of apparent ranges (SREP's byte 15 = 255), cut into strips."""
 
 from __future__ import annotations
 

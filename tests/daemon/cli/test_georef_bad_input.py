@@ -1,4 +1,4 @@
-"""``swath georef`` with what is damaged, missing or full: partial products say so, and refusals leave nothing."""
+"""Tests ``swath georef`` with damaged or missing input and full disks: partial products and refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``swath georef``: points where the truth is, every return accounted for, mistakes named, nothing half done."""
+"""Tests ``swath georef``: points are at the truth, every return is accounted for, and mistakes are named."""
 
 from __future__ import annotations
 

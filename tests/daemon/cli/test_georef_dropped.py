@@ -1,4 +1,4 @@
-"""``swath georef --write-dropped``: returns beyond the gate are withheld points, others are listed with a reason."""
+"""Tests ``swath georef --write-dropped``: returns beyond the gate are withheld points, others are listed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``swath georef`` with a gimbal whose angles are in the log: a receiver's INS tells them, the truth is SciPy's."""
+"""Tests ``swath georef`` with a gimbal whose angles a receiver's INS logs, against SciPy."""
 
 from __future__ import annotations
 

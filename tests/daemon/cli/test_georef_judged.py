@@ -1,4 +1,4 @@
-"""What is made with a trajectory or on a map that is not right: refused or called so, and taken at the user's word."""
+"""Tests products made with a wrong trajectory or map: refused, marked, or accepted on request."""
 
 from __future__ import annotations
 

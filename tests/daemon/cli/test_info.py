@@ -1,4 +1,4 @@
-"""``swath info``: its numbers are those of the wire, and what is wrong with a log is named."""
+"""Tests that the numbers of ``swath info`` are those of the wire, and that a log's faults are named."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ctrl-C and a full disk end every command in one line; nothing unfinished is left, whatever it was doing."""
+"""Tests that Ctrl-C and a full disk end every command in one line and leave nothing unfinished."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def place(tmp_path: Path) -> Iterator[Path]:
 
 
 def interrupted(at: str, *arguments: object, place: Path) -> tuple[int, str]:
-    """Run a command that gets a SIGINT when it reaches a phase; return its exit code and what it said on stderr."""
+    """Run a command that gets a SIGINT when it reaches a phase, and return its exit code and its stderr."""
     temporary = str(place.parent / "temporary")
     done = swath(*map(str, arguments), INTERRUPTED_AT=at, TMPDIR=temporary)
     return done.returncode, without_compiling(done.stderr)
@@ -231,7 +231,7 @@ def test_only_empty_folders_that_were_made_are_removed(tmp_path: Path) -> None:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """Return a file system with room enough when a command begins."""
+    """Return a file system with enough space when a command begins."""
     with disk_of(tmp_path / "disk", 48) as folder:
         yield folder
 

@@ -1,4 +1,4 @@
-"""An Ouster head that PTP sets, from its packets to points: on either scale, and only if it is on one."""
+"""Tests an Ouster head set by PTP, from packets to points: on either scale, and only on a known one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``swath plan-calibration``: verdicts of plans whose answer is known, the picture, and what is refused."""
+"""Tests ``swath plan-calibration``: verdicts of plans with known answers, the picture, and refusals."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Long work shows a bar on a terminal and lines elsewhere; short work shows nothing."""
+"""Tests that long work shows a bar on a terminal and lines elsewhere, and short work nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``swath recover`` by hand: what it saves, what it says, what it leaves alone, and its exit codes."""
+"""Tests ``swath recover`` by hand: what it saves, prints and leaves alone, and its exit codes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``swath sim`` as a user meets it: a log with all that belongs to it or none, wires in real time, one-line errors."""
+"""Tests ``swath sim``: a complete log or none, wires in real time, one-line errors."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def flown(plan: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, st
 
 
 def in_process(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
-    """Run a command without the second that a process of its own takes; exit code and what it said on stderr."""
+    """Run a command in this process, which saves the second of starting one, and return exit code and stderr."""
     code = cli.run_app(["sim", *arguments])
     return code, capsys.readouterr().err
 

@@ -1,4 +1,4 @@
-"""``swath strips`` on files as `swath georef` makes them, and on a flight: verdicts, exit codes, words."""
+"""Tests ``swath strips`` on files of `swath georef` and on a flight: verdicts, exit codes, words."""
 
 from __future__ import annotations
 

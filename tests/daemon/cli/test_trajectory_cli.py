@@ -1,4 +1,4 @@
-"""``swath trajectory``: where the truth is, within its own sigmas; everything accounted for; mistakes in one line."""
+"""Tests ``swath trajectory``: the truth within its sigmas, everything accounted for, mistakes in one line."""
 
 from __future__ import annotations
 

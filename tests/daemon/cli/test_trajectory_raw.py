@@ -1,4 +1,4 @@
-"""Logs for post-processing: raw measurements without a real-time fix, an IMU without a receiver, and holes in them."""
+"""Tests logs for post-processing: raw measurements, an IMU without a receiver, and gaps in them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``swath validate --anew`` on a log: parameters measured anew agree with a true calibration, and name a wrong one."""
+"""Tests ``swath validate --anew``: newly measured parameters confirm a true calibration and expose a wrong one."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
 
 
 def validated(made: Made, folder: Path, omega_deg: float, *, sigmas: bool = True) -> tuple[int, Any]:
-    """Return exit code and entry of the method for a calibration whose roll is wrong by so much."""
+    """Return exit code and entry of the method for a calibration whose roll is wrong by a given amount."""
     off = made.truth.changed(omega_rad=made.truth.value("omega_rad") + float(np.radians(omega_deg)))
     spread = np.zeros(len(INDEX))
     if sigmas:

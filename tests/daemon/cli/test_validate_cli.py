@@ -1,4 +1,4 @@
-"""``swath validate``: calibration files in, sentences and exit codes out; logs stood in for by a made flight."""
+"""Tests ``swath validate``: calibration files in, sentences and exit codes out, with a made flight as log."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def file_of(
 
 
 def boresight(phi_deg: float, scanner: str = "left") -> Calibration:
-    """Return a boresight with so much pitch."""
+    """Return a boresight with a given pitch."""
     return nominal(scanner, np.zeros(3), np.eye(3)).changed(phi_rad=float(np.radians(phi_deg)))
 
 
@@ -278,7 +278,7 @@ def test_an_unusable_record_is_reported_in_one_line(
 
 
 def control_of(made: Cast, path: Path, lower_m: float = 0.0) -> int:
-    """Write a file of so many points on, or below, the true surface."""
+    """Write a file of points on, or below, the true surface."""
     from swath.georef.geodesy.earth import geodetic_from_e
 
     places = made.true_t[0][20_000:180_000:8_000]

@@ -1,4 +1,4 @@
-"""``swath view``: the page, its pictures, its words for what is wrong."""
+"""Tests ``swath view``: its page, its pictures, and its words for faults."""
 
 from __future__ import annotations
 

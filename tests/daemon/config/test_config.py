@@ -1,4 +1,4 @@
-"""The configuration: the complete example, every bad one with its lines, the page that documents it."""
+"""Tests the configuration: the complete example, every bad one with its lines, and the page that documents it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings that are allowed and hardly meant, the geometry in words and as a drawing, as `swath check` prints them."""
+"""Tests allowed but improbable settings, and the geometry in words and as a drawing, as `swath check` prints them."""
 
 from __future__ import annotations
 

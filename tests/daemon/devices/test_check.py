@@ -1,4 +1,4 @@
-"""`swath check` on real ptys, UDP ports, CAN buses and FIFOs: what answers, what does not, what is something else."""
+"""Tests `swath check` on real ptys, UDP ports, CAN buses and FIFOs, with right, silent and wrong devices."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`swath setup` on real ptys and UDP ports, with receivers that accept, refuse, stay silent or talk all the time."""
+"""Tests `swath setup` on real ptys and UDP ports, with receivers that accept, refuse, stay silent or always send."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `swath check` reads in the values of devices at rest, on real wires and from real recordings."""
+"""Tests what `swath check` derives from values of devices at rest, on real wires and real recordings."""
 
 from __future__ import annotations
 

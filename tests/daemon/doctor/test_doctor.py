@@ -1,4 +1,4 @@
-"""``swath doctor``: a computer made of files, spoilt in one place after the other, and the one that runs this."""
+"""Tests ``swath doctor`` on a computer made of files with one fault at a time, and on this one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which line of chrony's configuration says whether the clock may be stepped in flight, and what changes it."""
+"""Tests which line of chrony's configuration allows steps of the clock in flight, and what changes it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logs out of units and units out of logs: what the tests of `swath import` and `swath export` share."""
+"""Makes logs from units and units from logs, for the tests of `swath import` and `swath export`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``swath export``: other tools read of its files what was on the wire, and import makes the same log of them."""
+"""Tests ``swath export``: other tools read the wire's content from its files, and import restores the log."""
 
 from __future__ import annotations
 
@@ -176,7 +176,7 @@ ANY_UNIT = st.one_of(
 
 
 def there_and_back(folder: Path, config: Config, units: list[Unit]) -> None:
-    """Log, export, import by the exported configuration: the same log, and the same files again."""
+    """Export a log and import it by the exported configuration, and check that log and files are the same again."""
     log = write_log(folder / "log", config, units)
     report = export(log, folder / "out")
     again = load_config(report.folder / "config/config.toml")

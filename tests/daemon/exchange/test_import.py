@@ -1,4 +1,4 @@
-"""``swath import``: real captures become logs like a recorder's; what is wrong with one is told, never a traceback."""
+"""Tests ``swath import``: real captures become logs like a recorder's, and faults are reported in a line."""
 
 from __future__ import annotations
 

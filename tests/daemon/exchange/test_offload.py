@@ -1,4 +1,4 @@
-"""``swath offload``: real logs to a real folder, checked by coreutils; interrupted, falsified, without room."""
+"""Tests ``swath offload`` of real logs, checked by coreutils: interruptions, falsified copies, full disks."""
 
 from __future__ import annotations
 

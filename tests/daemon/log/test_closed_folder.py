@@ -1,4 +1,4 @@
-"""A log directory below a folder that may not be entered: said in a line by ``swath check`` and ``swath doctor``."""
+"""Tests that a log directory below a forbidden folder is reported by ``swath check`` and ``swath doctor``."""
 
 from __future__ import annotations
 

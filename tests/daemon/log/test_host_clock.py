@@ -1,4 +1,4 @@
-"""Host time: kernel stamps land where they belong, whatever the wall clock does."""
+"""Tests that kernel stamps become host time correctly, whatever the wall clock does."""
 
 from __future__ import annotations
 

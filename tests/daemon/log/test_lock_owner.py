@@ -1,4 +1,4 @@
-"""The lock of a log directory that root has recorded in: the service, another user, must record there afterwards."""
+"""Tests that the service, another user, can record in a log directory in which root has recorded."""
 
 from __future__ import annotations
 

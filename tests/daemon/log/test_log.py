@@ -1,4 +1,4 @@
-"""The log: official readers accept what is written; what is broken is told, skipped and mended, never believed."""
+"""Tests the log: official readers accept it; damage is reported, skipped and repaired, never believed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A chunk's messages as runs of equal channel and length: all of them, each run whole, however long it is."""
+"""Tests that a chunk's messages are read as whole runs of equal channel and length."""
 
 from __future__ import annotations
 

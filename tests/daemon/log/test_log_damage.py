@@ -1,4 +1,4 @@
-"""Damage to the records between chunks, which have no CRC: no good chunk is passed over, nothing is lost silently."""
+"""Tests damage to records between chunks, which have no CRC: no good chunk is missed, no loss is silent."""
 
 from __future__ import annotations
 

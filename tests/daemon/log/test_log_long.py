@@ -1,4 +1,4 @@
-"""The official TypeScript reader, a second implementation beside Python's, reads what we write and what we mend."""
+"""Tests that the official TypeScript reader reads written and repaired logs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A log from a stranger: whatever it claims is said in a line, takes little memory and is written nowhere else.
+"""Tests that a foreign log's false claims are reported in a line, take little memory, and are not copied.
 
 All files go through all commands in one process, the peak of its memory reset before each (proc(5), clear_refs).
 """

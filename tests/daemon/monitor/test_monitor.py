@@ -1,4 +1,4 @@
-"""``swath monitor``: what it says of a running recorder is what was sent to it."""
+"""Tests that ``swath monitor`` reports of a running recorder what was sent to it."""
 
 from __future__ import annotations
 

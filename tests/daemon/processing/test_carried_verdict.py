@@ -1,4 +1,4 @@
-"""What was judged of a calibration or a trajectory is told of everything that is made with it."""
+"""Tests that verdicts on a calibration or a trajectory are passed on to everything made with it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compilations are noticed, here and in worker processes, and the user is told once."""
+"""Tests that compilations are noticed, also in worker processes, and reported once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files of an earlier run are refused, replaced or removed; foreign files stay."""
+"""Tests that files of an earlier run are refused, replaced or removed, and foreign files stay."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A trajectory from a file is held against the log's own fixes and IMU, and what is wrong with it is named."""
+"""Tests that a given trajectory is compared with the log's fixes and IMU, and its faults are named."""
 
 from __future__ import annotations
 

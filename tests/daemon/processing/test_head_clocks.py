@@ -1,4 +1,4 @@
-"""Heads whose own time suffices: what a log's scanners' stamps count from, found before any return is placed."""
+"""Tests heads with sufficient time: the origin of a log's stamps is found before any return is placed."""
 
 from __future__ import annotations
 

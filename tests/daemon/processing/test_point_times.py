@@ -1,4 +1,4 @@
-"""GPS times of points of any LAS file: what the header says, what the times say, and which week they are of."""
+"""Tests GPS times of points of any LAS file: what header and times imply, and their week."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cells and differences of strips go by the points alone, and one measure gives one level wherever it is told."""
+"""Tests that cells and differences of strips depend on the points alone, with one level everywhere."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``swath warm-up``: after it nothing is left to be compiled, and nothing to be read from the cache either."""
+"""Tests that after ``swath warm-up`` nothing is compiled or read from the cache."""
 
 from __future__ import annotations
 

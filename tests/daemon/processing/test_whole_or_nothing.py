@@ -1,4 +1,4 @@
-"""What is put in its place is on the disk before it has its name, and an interruption leaves nothing beside it."""
+"""Tests that a product is on the disk before it gets its name, and that interruptions leave nothing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a user gets wrong: one clear line that says what, where and what would be right, and the right exit code."""
+"""Tests users' mistakes: one line with fact and remedy, and the right exit code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames lost on a CAN bus, by commands alone: what is left is counted, navigated, and what is missing is said."""
+"""Tests frames lost on a CAN bus: the rest is counted and navigated, and the loss is reported."""
 
 from __future__ import annotations
 

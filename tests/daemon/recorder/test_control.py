@@ -1,4 +1,4 @@
-"""``swath mark`` and ``swath split``: a real recorder, its socket, and everything that can be done to it."""
+"""Tests ``swath mark`` and ``swath split`` with a real recorder, and all abuse of its socket."""
 
 from __future__ import annotations
 

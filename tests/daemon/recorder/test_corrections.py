@@ -1,4 +1,4 @@
-"""Corrections of a base station: logged byte for byte from a caster or a port, counted, and handed on to a receiver."""
+"""Tests corrections of a base station: logged byte for byte, counted, and passed to a receiver."""
 
 from __future__ import annotations
 

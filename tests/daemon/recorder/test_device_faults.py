@@ -1,4 +1,4 @@
-"""What devices do wrong while recording: every unit is in the log as it came, and the trouble is told."""
+"""Tests faults of devices while recording: every unit is logged as it came, and the fault is reported."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A disk that fills up: told at once, counted to the unit, the file whole, and recording again when there is room."""
+"""Tests a disk that fills up: reported at once, counted to the unit, and resumed with space."""
 
 from __future__ import annotations
 

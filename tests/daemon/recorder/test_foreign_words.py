@@ -1,4 +1,4 @@
-"""What others say to the recorder's commands: an answer, a sign, a status, a text from anywhere."""
+"""Tests foreign input to the recorder's commands: an answer, a sign, a status, any text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""kill -9 at a hundred random moments: what was on the wire half a second before is in the log.
+"""Tests kill -9 at a hundred random moments: what was sent half a second before is in the log.
 
 Half a second of a machine that runs: what a bystander on the same machine was held up does not count.
 """

@@ -1,4 +1,4 @@
-"""An inertial unit that holds a receiver: one wire, two sections, on a real bus."""
+"""Tests an inertial unit that contains a receiver: one wire, two sections, on a real bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What can go wrong while recording, done to a running recorder; afterwards every unit is accounted for."""
+"""Tests faults inflicted on a running recorder; afterwards every unit is accounted for."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Time while recording: a real NovAtel recording and its edges, fed through the wiring that the configuration makes."""
+"""Tests time while recording: a real NovAtel recording and its edges through the configured wiring."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def assembled(folder: Path, gnss: str = "", pps: str = "") -> Assembly:
 
 
 def play(assembly: Assembly, discipline: ClockDiscipline = UNDISCIPLINED) -> tuple[list[str], int]:
-    """Feed the recording; the state of the PPS at each edge, and the last edge's host time."""
+    """Feed the recording, and return the state of the PPS at each edge and the last edge's host time (ns)."""
     keeper, start_ns = assembly.timekeeper, assembly.clock.now_ns()
     units_seen, edge_seen = keeper.units_seen("gnss/rover"), keeper.edge_seen("pps/main")
     states: list[str] = []

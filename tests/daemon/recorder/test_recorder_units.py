@@ -1,4 +1,4 @@
-"""The recorder's pieces one by one, on real files and sockets, without its threads."""
+"""Tests the recorder's parts one by one, on real files and sockets, without its threads."""
 
 from __future__ import annotations
 

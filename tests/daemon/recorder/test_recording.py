@@ -1,4 +1,4 @@
-"""``swath run`` as a service runs it: real ports, real files, every byte, every state."""
+"""Tests ``swath run`` as a service runs it: real ports, real files, every byte, every state."""
 
 from __future__ import annotations
 

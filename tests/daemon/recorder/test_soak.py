@@ -1,4 +1,4 @@
-"""The soak's own checks: each must be able to fail."""
+"""Tests that each check of the soak test can fail."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every driver of a byte stream over every wire that carries one: pty, UDP and TCP, on real devices and sockets."""
+"""Tests every driver of a byte stream over every wire: pty, UDP and TCP, on real devices and sockets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Nothing is loaded from the disk when the time locks in flight: meanwhile edges would wait, and be overwritten."""
+"""Tests that nothing is loaded from disk when time locks in flight, because edges would be overwritten."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The wall clock really stepped by an hour, forth and back, while recording. It moves everybody's clock."""
+"""Tests recording while the wall clock is stepped by an hour in both directions, which affects all programs."""
 
 from __future__ import annotations
 

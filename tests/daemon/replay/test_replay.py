@@ -1,4 +1,4 @@
-"""``swath replay``: what a second recorder gets from the wires is what the first one got."""
+"""Tests that ``swath replay`` gives a second recorder what the first one recorded."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def first(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, LogContent]:
 
 
 def replay_into_a_recorder(folder: Path, logs: Path, pace: str) -> tuple[LogContent, str]:
-    """Play logs to a second recorder that was there first; what it recorded, and what replay said."""
+    """Play logs to a second recorder that was started first, and return what it recorded and what replay reported."""
     port, link, fifo = free_udp_port(), folder / "rover", folder / "pps"
     config = session_table(folder / "logs") + SREP.format(port=port) + TIMED.format(path=link, fifo=fifo)
     config += BUS.format(port=free_udp_port())

@@ -1,4 +1,4 @@
-"""A flight into a log: what a recorder on board would have written, and the same bytes each time.
+"""Tests a simulated log: it is what a recorder on board would have written, with the same bytes each time.
 
 The flight is a stand-in, so that what is looked at here is the way into the log alone.
 """

@@ -1,4 +1,4 @@
-"""Capture files: real recordings of each kind, and files that are cut, damaged or something else."""
+"""Tests capture files: real recordings of each kind, and files that are cut, damaged or of another kind."""
 
 from __future__ import annotations
 

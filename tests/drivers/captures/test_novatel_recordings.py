@@ -1,4 +1,4 @@
-"""NovAtel's recordings in other forms: its ROS driver's messages, its converter's formats, and the TCP packets."""
+"""Tests NovAtel's recordings in other forms: its ROS driver's messages, its converter's formats, TCP packets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Datagrams as pcap frames: what dpkt reads of them, and what our own reader does."""
+"""Tests datagrams written as pcap frames with dpkt and with our own reader."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""RTKLIB's time tags: its own files, others laid out by hand as src/stream.c writes them, and those of our writer."""
+"""Tests RTKLIB's time tags: its own files, files laid out by hand from src/stream.c, and our writer's."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""RTCM 3 on real recordings: counts against pyrtcm's, the station's coordinates too; every cut; damage."""
+"""Tests RTCM 3 on real recordings: pyrtcm's counts and station coordinates, every cut, damage."""
 
 from __future__ import annotations
 

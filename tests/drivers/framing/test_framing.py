@@ -1,4 +1,4 @@
-"""Checksums against other implementations; the framer against every recording, false syncs, cuts and bounds."""
+"""Tests checksums against other implementations, and the framer on every recording, false syncs, cuts, limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""CANmod.gps: two real recordings against cantools' decoding of them, frame by frame."""
+"""Tests CANmod.gps: two real recordings against cantools' decoding of them, frame by frame."""
 
 from __future__ import annotations
 

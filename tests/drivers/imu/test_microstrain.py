@@ -1,4 +1,4 @@
-"""MicroStrain MIP: a recording by the maker's own library, the SDK's example, and what the recording lacks."""
+"""Tests MicroStrain MIP: a recording by the maker's library, the SDK's example, and what the recording lacks."""
 
 from __future__ import annotations
 

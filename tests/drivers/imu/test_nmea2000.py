@@ -1,4 +1,4 @@
-"""NMEA 2000: a busy bus against another decoder's values, in order; sources; fast packets; damage."""
+"""Tests NMEA 2000: a busy bus against another decoder's values, in order; sources; fast packets; damage."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def test_the_first_source_of_each_pgn_is_used_and_the_others_counted() -> None:
 
 
 def r_message(record: Record) -> str:
-    """Name of the message, where the record has one."""
+    """Return the name of the message, if the record has one."""
     return getattr(record, "message", "")
 
 

@@ -1,4 +1,4 @@
-"""SBG Ellipse on CAN: frames that cantools makes by the maker's DBC; identifiers, the latched Sync In, settings."""
+"""Tests SBG Ellipse on CAN with frames made by cantools and the maker's DBC: identifiers, Sync In, settings."""
 
 from __future__ import annotations
 

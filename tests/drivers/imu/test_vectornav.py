@@ -1,4 +1,4 @@
-"""VectorNav: every value of three recordings of a VN-310 by INSTINCT's decoding, and what the recordings lack."""
+"""Tests VectorNav: every value of three recordings of a VN-310 by INSTINCT's decoding, and what they lack."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Xsens MTi on CAN: frames packed by hand as MT1604P lays them out, in both byte orders; groups, gaps, settings."""
+"""Tests Xsens MTi on CAN with frames packed by hand from MT1604P, in both byte orders: groups, gaps, settings."""
 
 from __future__ import annotations
 

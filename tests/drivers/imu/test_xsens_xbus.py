@@ -1,4 +1,4 @@
-"""Xbus on two recordings against another library's decoding of them; number formats, framing, times and gaps."""
+"""Tests Xbus on two recordings against another library's decoding; number formats, framing, times and gaps."""
 
 from __future__ import annotations
 

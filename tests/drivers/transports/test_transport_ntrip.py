@@ -1,4 +1,4 @@
-"""The NTRIP client against a caster on a real socket: both versions, chunks, refusals, losses; no byte more or less."""
+"""Tests the NTRIP client against a caster on a real socket: both versions, chunks, refusals, losses, every byte."""
 
 from __future__ import annotations
 

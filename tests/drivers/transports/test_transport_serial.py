@@ -1,4 +1,4 @@
-"""Serial ports on real pseudo terminals: content, unplug, replug, two readers, and errors that say what is wrong."""
+"""Tests serial ports on real pseudo terminals: content, unplug, replug, two readers, and clear errors."""
 
 from __future__ import annotations
 

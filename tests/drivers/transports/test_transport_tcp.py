@@ -1,4 +1,4 @@
-"""The TCP client against servers on real sockets: every byte, the kernel's stamps, losses, mute ends."""
+"""Tests the TCP client against servers on real sockets: every byte, the kernel's stamps, losses, silent ends."""
 
 from __future__ import annotations
 

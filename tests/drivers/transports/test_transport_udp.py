@@ -1,4 +1,4 @@
-"""UDP over real sockets of this machine: order, stamps, exact losses, filters, and errors that say what is wrong."""
+"""Tests UDP over real sockets of this machine: order, stamps, exact losses, filters, and clear errors."""
 
 from __future__ import annotations
 

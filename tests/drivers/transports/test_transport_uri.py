@@ -1,4 +1,4 @@
-"""Transport strings: what is right is read, what is wrong is one line that says what would be right."""
+"""Tests transport strings: right ones are read, wrong ones give one line with the remedy."""
 
 from __future__ import annotations
 

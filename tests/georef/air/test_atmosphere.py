@@ -1,4 +1,4 @@
-"""The air: the formula sheet's numbers, PROJ's verticals, exact integrals, the virtual aircraft's own air."""
+"""Tests the air: the formula sheet's numbers, PROJ's verticals, exact integrals, the virtual aircraft's air."""
 
 from __future__ import annotations
 

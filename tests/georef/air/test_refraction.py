@@ -1,4 +1,4 @@
-"""Bending: the numbers of the formula sheet (4.1 to 4.3), and the sheet's integral done again by SciPy."""
+"""Tests bending: the numbers of the formula sheet (4.1 to 4.3), and its integral computed by SciPy."""
 
 from __future__ import annotations
 

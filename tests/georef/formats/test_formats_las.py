@@ -1,4 +1,4 @@
-"""LAZ and COPC as written, against what laspy reads of them and against LAS 1.4's own definitions."""
+"""Tests LAZ and COPC as written against laspy and the definitions of LAS 1.4."""
 
 from __future__ import annotations
 

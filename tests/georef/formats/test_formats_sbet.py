@@ -1,4 +1,4 @@
-"""SBET and smrmsg: PDAL's file, POSPac's axes, weeks, and files that are wrong."""
+"""Tests SBET and smrmsg: PDAL's file, POSPac's axes, weeks, and wrong files."""
 
 from __future__ import annotations
 

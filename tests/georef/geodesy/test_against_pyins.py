@@ -1,4 +1,4 @@
-"""The filter beside pyins' on the same samples and fixes: another's code, another frame, the same estimate."""
+"""Tests the filter against pyins', with other code in another frame, on the same samples and fixes."""
 
 from __future__ import annotations
 

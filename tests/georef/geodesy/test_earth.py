@@ -1,4 +1,4 @@
-"""Geodesy against the formula sheet and PROJ."""
+"""Tests geodesy against the formula sheet and PROJ."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gravity against published values and the simulator's, its gradient against differences."""
+"""Tests gravity against published values and the simulator's, and its gradient against differences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Quaternion arithmetic against SciPy's rotations."""
+"""Tests quaternion arithmetic against SciPy's rotations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rotations against the formula sheet and SciPy."""
+"""Tests rotations against the formula sheet and SciPy."""
 
 from __future__ import annotations
 

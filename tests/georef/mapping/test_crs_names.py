@@ -1,4 +1,4 @@
-"""Names of coordinate systems as people write them: what is understood, and what is proposed."""
+"""Tests names of coordinate systems as people write them: which are understood, and which are proposed."""
 
 from __future__ import annotations
 

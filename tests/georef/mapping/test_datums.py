@@ -1,4 +1,4 @@
-"""Which operation is taken, which are refused, and what the refusals say; figures from PROJ asked directly."""
+"""Tests which datum operations are chosen and which are refused; the figures come from PROJ directly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Expansions over cubes, on maps whose values and derivatives are known in closed form."""
+"""Tests expansions over cubes, on maps whose values and derivatives are known in closed form."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ HERE = np.array([4_260_000.0, 670_000.0, 4_680_000.0])
 
 
 def quadratic(points: FloatArray) -> FloatArray:
-    """Map that a second-order expansion reproduces exactly."""
+    """Map points by second-order terms only, which an expansion reproduces exactly."""
     x, y, z = ((points - HERE) / 1000.0).T
     return np.stack([1e5 + x - 2 * y + 3 * x * y, 2e5 + x * x - z * z + y * z, z + 0.5 * y * y + x * z], axis=-1)
 

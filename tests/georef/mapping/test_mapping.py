@@ -1,4 +1,4 @@
-"""Coordinates of the mapping frame: numbers of FORMULAS 1.9, PROJ's pipelines written by hand, grids made here."""
+"""Tests coordinates of the mapping frame: FORMULAS 1.9, PROJ's pipelines written by hand, grids made here."""
 
 from __future__ import annotations
 

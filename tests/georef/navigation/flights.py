@@ -1,4 +1,4 @@
-"""Truth once, noise many times: increments of `sim`'s inertial unit on smooth motions, and a filter's start."""
+"""Makes one truth with many noises: increments of the simulated inertial unit, and a filter's start."""
 
 from __future__ import annotations
 

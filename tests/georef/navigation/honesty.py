@@ -1,4 +1,4 @@
-"""Whether sigmas are what errors are: normalised estimation errors squared (NEES), over many flights with drawn noise.
+"""Tests whether sigmas equal errors: normalised estimation errors squared (NEES) over many flights.
 
 Errors of neighbouring moments are alike, so that a flight of many samples has few independent ones. Their number is
 found from the flights themselves: with v₁ the variance of the NEES at one moment and v the variance, from flight to

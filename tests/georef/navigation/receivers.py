@@ -1,4 +1,4 @@
-"""Receivers that tell their sigmas truly, too small, too large, or not; and the smoother that knows their noise."""
+"""Provides receivers that state their sigmas truly, too small, too large or not, and the ideal smoother."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How the reference flights and the car are scored, by their README."""
+"""Scores the reference flights and the car as their README does."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Made-up samples are as wrong as said: against the samples that were lost, and over whole flights."""
+"""Tests that bridged samples are as wrong as stated, against the lost samples and over whole flights."""
 
 from __future__ import annotations
 

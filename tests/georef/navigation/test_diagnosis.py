@@ -1,4 +1,4 @@
-"""Every fault put into sound data is found and named, and nothing is found in data that are sound."""
+"""Tests that every fault put into sound data is found and named, and that sound data give no finding."""
 
 from __future__ import annotations
 

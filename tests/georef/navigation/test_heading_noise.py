@@ -1,4 +1,4 @@
-"""What a flight says of a second antenna's headings: which part of their errors lasts, and for how long.
+"""Tests which part of a second antenna's heading errors lasts, and how long, as estimated from a flight.
 
 Twenty flights of each kind are `python -m benchmarks.navigation_honesty --headings`.
 """

@@ -1,4 +1,4 @@
-"""Sigmas are what errors are: over seeds, with white and with lasting errors of GNSS (the long run is a benchmark)."""
+"""Tests that sigmas equal errors over many seeds, with white and lasting GNSS errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sensors that are turned, swapped or mirrored: of all 48 ways each is found, with the remedy that mends it."""
+"""Tests sensors that are rotated, swapped or mirrored: each of 48 ways is found, with the right remedy."""
 
 from __future__ import annotations
 

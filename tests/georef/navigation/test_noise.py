@@ -1,4 +1,4 @@
-"""What a flight says of its receiver's noise: scales up and down by kind, fix type and axis; the share that lasts.
+"""Tests the receiver's noise estimated from a flight: scales by kind, fix type and axis; the lasting share.
 
 Fifty flights of each kind are `python -m benchmarks.navigation_honesty --receivers`.
 """

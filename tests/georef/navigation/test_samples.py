@@ -1,4 +1,4 @@
-"""Sampler: increments against integrals known in closed form, however stamps jitter, rows are cut, lost or spoilt."""
+"""Tests the sampler against integrals in closed form, with jittering stamps and cut, lost or spoilt rows."""
 
 from __future__ import annotations
 

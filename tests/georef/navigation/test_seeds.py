@@ -1,4 +1,4 @@
-"""The virtual aircraft with its own inertial unit: errors on the lines are as predicted, with axes that lean too.
+"""Tests the virtual aircraft's navigation: errors on the lines are as predicted, with misaligned axes too.
 
 The long run is `python -m benchmarks.navigation_seeds`.
 """

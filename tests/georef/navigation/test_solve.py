@@ -1,4 +1,4 @@
-"""Whole flights: begun in the air, the real car's clock and outages, and noise that the flight itself tells."""
+"""Tests whole flights: a start in the air, the real car's clock and outages, and noise found from the flight."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Standing still: a synthetic unit that stands, flies evenly, turns and rolls; and the reference flight's truth."""
+"""Tests detection of standing still: a unit that stands, flies steadily, turns and rolls, and the true flight."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Another noise of the unit is asked for where the flight's innovations fit it, and only there."""
+"""Tests that another noise of the unit is proposed exactly where the flight's innovations fit it."""
 
 from __future__ import annotations
 

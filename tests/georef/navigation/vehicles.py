@@ -1,5 +1,4 @@
-"""Inertial samples and observations whose truth is known: the reference flights, two real recordings, and motions of
-`sim`'s inertial unit, exact to its integration, anywhere on earth."""
+"""Provides inertial samples and observations with known truth: reference flights, recordings, exact motions."""
 
 from __future__ import annotations
 

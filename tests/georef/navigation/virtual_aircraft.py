@@ -1,4 +1,4 @@
-"""The virtual aircraft's flights, inertial units and receivers, as navigation takes them: no wires, no log.
+"""Provides the virtual aircraft's flights, inertial units and receivers for navigation, without wires and logs.
 
 The way is flown once by `swath.sim.flight.trajectory`; units and receivers draw their errors anew with each seed, as
 `swath.sim.imu.sensors` and `swath.sim.gnss.receiver` make them.

@@ -1,4 +1,4 @@
-"""Heads that give a direction by two angles: points by hand, sigmas by draws, rows that are divided for the kernels."""
+"""Tests heads that give a direction by two angles: points by hand, sigmas by draws, rows divided for kernels."""
 
 from __future__ import annotations
 

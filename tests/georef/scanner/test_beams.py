@@ -1,4 +1,4 @@
-"""Beams of every type of scanner: the numbers of FORMULAS 2.2, and what a calibration must not have."""
+"""Tests beams of every type of scanner: the numbers of FORMULAS 2.2, and impossible calibrations."""
 
 from __future__ import annotations
 

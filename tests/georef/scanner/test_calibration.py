@@ -1,4 +1,4 @@
-"""The calibration file: CONVENTIONS' page, in SI units; every mistake in one line."""
+"""Tests the calibration file: the conventions page in SI units, and every mistake in one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Encoder motion: rates against closed forms of the motion, with whole counts, gaps, repeated rows and jumps."""
+"""Tests encoder motion: rates in closed form, with whole counts, gaps, repeated rows and jumps."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Analytic columns against central differences of the model itself, and the printed ones (FORMULAS 5.2, 5.3)."""
+"""Tests analytic derivatives against central differences of the model, and printed ones (FORMULAS 5.2, 5.3)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gimbals: stages nested as NGA Eq. 3 nests them, fixed and moving."""
+"""Tests gimbals: stages nested as in NGA Eq. 3, fixed and moving."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ranging: the formula sheet's numbers; pulses in air against a virtual scanner that knows every echo's pulse."""
+"""Tests ranging: the formula sheet's numbers, and pulses in air against a scanner with known pulses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The sensor model against pyproj and SciPy, everywhere on earth, with every scanner and every error at once."""
+"""Tests the sensor model against pyproj and SciPy, everywhere on earth, with every scanner and error at once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Predicted covariances against draws of all inputs through a forward model of NumPy, SciPy and PROJ."""
+"""Tests predicted covariances against draws of all inputs through a model of NumPy, SciPy and PROJ."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stream: what is decided when, with stand-ins for trajectory and model, and clocks of known time."""
+"""Tests the stream: its decisions over time, with stand-ins for trajectory and model, and known clocks."""
 
 from __future__ import annotations
 

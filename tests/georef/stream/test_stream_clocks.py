@@ -1,4 +1,4 @@
-"""The clocks of a stream: what the recorder knew of the second is known again when its log is read."""
+"""Tests the clocks of a stream: the second that the recorder knew is known again when its log is read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Messages that run faster or slower than the host, as those of a log played at another pace, give no time."""
+"""Tests that messages at another rate than the host's, as of a log replayed at another pace, give no time."""
 
 from __future__ import annotations
 

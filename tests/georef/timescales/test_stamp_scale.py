@@ -1,4 +1,4 @@
-"""What a head's stamps count from: PTP in TAI or UTC, the hour of UTC, its own start; by arrival or configured."""
+"""Tests the origin of a head's stamps: PTP in TAI or UTC, the UTC hour, its own start; found or configured."""
 
 from __future__ import annotations
 

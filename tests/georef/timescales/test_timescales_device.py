@@ -1,4 +1,4 @@
-"""Device clocks: latched edges, UTC-hour stamps, arrivals alone; restarts, missing and spurious latches, delays."""
+"""Tests device clocks: latched edges, UTC-hour stamps, arrivals; restarts, missing and spurious latches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""GPS time and UTC against FORMULAS 12 and the calendar of the standard library."""
+"""Tests GPS time and UTC against FORMULAS 12 and the calendar of the standard library."""
 
 from __future__ import annotations
 

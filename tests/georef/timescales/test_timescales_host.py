@@ -1,4 +1,4 @@
-"""Host time to CLOCK_MONOTONIC_RAW, and properties of the clock whatever comes in."""
+"""Tests the conversion of host time to CLOCK_MONOTONIC_RAW, and the clock's properties for any input."""
 
 from __future__ import annotations
 

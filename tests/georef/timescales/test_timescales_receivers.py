@@ -1,4 +1,4 @@
-"""Real receivers' time messages on one clock: UTC with leap seconds and week with time of week name one second.
+"""Tests real receivers' time messages on one clock: UTC with leap seconds and GPS week name one second.
 
 The recordings carry no arrival times, so the edges are put where the receiver's own seconds begin and its messages
 50 ms later; what is tested is that all kinds of messages agree, and that the label is the receiver's second.

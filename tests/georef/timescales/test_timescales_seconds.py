@@ -1,4 +1,4 @@
-"""Which second: 0 wrong ones while LOCKED or HOLDOVER, over 1e5 simulated seconds of everything that goes wrong.
+"""Tests that no second is wrong while LOCKED or HOLDOVER, over 1e5 simulated seconds with all faults.
 
 Simulated (clock_simulation.py): 23 ppm, a random walk of the frequency of 2e-9/√s, ramps of 0.5 ppm/min where said;
 stamps of 1.5 µs or 300 µs; 1 % outliers of 300 µs, 2 to 10 % missing and 1 to 5 % spurious edges; messages 5 ms to

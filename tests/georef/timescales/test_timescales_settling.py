@@ -1,4 +1,4 @@
-"""After the flight the second is the one that most messages name; in flight the source of a label may take it back."""
+"""Tests that the second after the flight is that of most messages, and in flight its source may withdraw it."""
 
 from __future__ import annotations
 

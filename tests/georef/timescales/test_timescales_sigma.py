@@ -1,4 +1,4 @@
-"""The sigma is honest, and how good the time is.
+"""Tests that the clock's sigma is honest, and how good the time is.
 
 Simulated: frequency 23 ppm with a random walk of 2e-9/√s, with and without temperature ramps of 0.5 ppm/min (1 to 5 min
 long, 1 to 7 min apart); stamps of 1.5 µs (kernel) and 300 µs (user space); 1 % outliers, 2 % missing, 1 % spurious

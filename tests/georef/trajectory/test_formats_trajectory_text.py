@@ -1,4 +1,4 @@
-"""Trajectories in text: the project's CSV, Waypoint's exports, RTKLIB's positions."""
+"""Tests trajectories in text: the project's CSV, Waypoint's exports, RTKLIB's positions."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trajectories against SciPy's slerp, PROJ and hand-made motions."""
+"""Tests trajectories against SciPy's slerp, PROJ and hand-made motions."""
 
 from __future__ import annotations
 

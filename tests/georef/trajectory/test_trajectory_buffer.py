@@ -1,4 +1,4 @@
-"""The growing trajectory against the one made at once, with rows late, twice and without a solution."""
+"""Tests the growing trajectory against the complete one, with rows late, twice and without a solution."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Times of trajectories that are wrong by an amount the test knows, in rough air of the virtual aircraft."""
+"""Tests trajectories whose times are wrong by a known amount, in rough air of the virtual aircraft."""
 
 from __future__ import annotations
 

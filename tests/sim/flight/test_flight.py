@@ -1,4 +1,4 @@
-"""The flown trajectory against PROJ, SciPy, differences in time and the physics of a coordinated turn."""
+"""Tests the flown trajectory against PROJ, SciPy, time differences and the physics of a coordinated turn."""
 
 from __future__ import annotations
 

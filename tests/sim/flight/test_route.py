@@ -1,4 +1,4 @@
-"""Dubins' ways against closed forms and what makes a way the shortest; legs against what they promise."""
+"""Tests Dubins' paths against closed forms and the criterion of the shortest; legs keep their promises."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The receiver's bytes, read by this project's parsers and by others, against PROJ, scipy and the calendar."""
+"""Tests the receiver's bytes with this project's and other parsers, against PROJ, SciPy and the calendar."""
 
 from __future__ import annotations
 

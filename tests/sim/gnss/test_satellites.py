@@ -1,4 +1,4 @@
-"""Solutions of the virtual receiver: geometry against PROJ and scipy, errors against their closed-form covariance."""
+"""Tests the virtual receiver's solutions: geometry by PROJ and SciPy, errors by their covariance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames of the virtual unit, read by the parser that reads any unit by its DBC: values, stamps and edges come back."""
+"""Tests frames of the virtual unit with the parser that reads any DBC: values, stamps and edges return."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Gravity against published values and the normal potential; a unit's samples against closed forms and its grade."""
+"""Tests gravity against published values and the normal potential, and samples against closed forms."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What perfect sensors measure leads back to the flight they flew."""
+"""Tests that the measurements of perfect sensors lead back to the flight."""
 
 from __future__ import annotations
 

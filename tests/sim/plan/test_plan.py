@@ -1,4 +1,4 @@
-"""Plans: what is loaded, what is refused in one line, and the page that documents every key."""
+"""Tests plans: what is loaded, refusals in one line, and the page that documents every key."""
 
 from __future__ import annotations
 

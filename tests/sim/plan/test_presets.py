@@ -1,4 +1,4 @@
-"""Every preset, and every plan of the page, can be flown and is what the page says it is."""
+"""Tests that every preset, and every plan of the page, can be flown and is as the page states."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a plan covers, against hand computation and the scanners' own pulses; the picture is drawn and has its size."""
+"""Tests what a plan covers, against hand computation and the scanners' own pulses, and its picture."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A plan's page: coordinates, colours and words are measured as they are drawn."""
+"""Tests a plan's page: coordinates, colours and words are measured as drawn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Line scanners: FORMULAS 2.2's numbers, and CONVENTIONS' equations written here applied to what the encoder says."""
+"""Tests line scanners: FORMULAS 2.2's numbers, and the conventions' equations applied to encoder readings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An OS1's packets, read back by this project's parser: returns, columns, stamps by the sync pulse, metadata."""
+"""Tests an OS1's packets with this project's parser: returns, columns, sync pulse stamps, metadata."""
 
 from __future__ import annotations
 

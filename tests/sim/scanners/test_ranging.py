@@ -1,4 +1,4 @@
-"""The receiver: CONVENTIONS' equation gives the true range back; intensities, noise and widths by closed forms."""
+"""Tests the ranging receiver: the conventions' equation gives the true range; intensities, noise, widths."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Spinning heads: the manuals' firing times, the formula sheet's points, drivers' points, cuts, what is refused."""
+"""Tests spinning heads: the manuals' firing times, points of formula sheet and drivers, cuts, refusals."""
 
 from __future__ import annotations
 

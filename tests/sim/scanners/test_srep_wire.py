@@ -1,4 +1,4 @@
-"""SREP on the wire: this project's parser gives every true return back, in the order of its row."""
+"""Tests SREP on the wire: this project's parser returns every true return, in the order of its row."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A VLP-16's packets, read back by this project's parser: returns, times, azimuths, PPS status, sentences."""
+"""Tests a VLP-16's packets with this project's parser: returns, times, azimuths, PPS status, sentences."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ground, villages, forests and control points of scenes, and plans that make none."""
+"""Tests ground, villages, forests and control points of scenes, and impossible plans."""
 
 from __future__ import annotations
 

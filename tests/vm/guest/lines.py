@@ -1,4 +1,4 @@
-"""The wires of a flight that is flown outside: CAN frames from a TCP stream, PPS at the moments it has outside.
+"""Connects a flight outside the machine: CAN frames from a TCP stream, PPS at the moments it has outside.
 
     lines.py CAN_INTERFACE CAN_PORT CLOCK_HOST:CLOCK_PORT
 

@@ -1,4 +1,4 @@
-"""What a unit's sandbox lets through and what it denies: a JSON object, ``true`` where it succeeded, else the errno."""
+"""Probes a unit's sandbox, and prints a JSON object: ``true`` where an attempt succeeded, else the errno."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Sensors of an aircraft in the machine, all units numbered: UDP, serial, CAN. What was sent when is left in a file.
+"""Simulates an aircraft's sensors in the machine with numbered units: UDP, serial, CAN; notes when it sent them.
 
     sensors.py FOLDER [--udp PORT:RATE] [--serial DEVICE] [--can INTERFACE:RATE] [--seconds S]
 

@@ -1,4 +1,4 @@
-"""What the kernel has said is on the disk: after each fdatasync of the writer, how much of the log stands there.
+"""Records what the kernel has declared durable: after each fdatasync of the writer, the size of the log.
 
     witness.py LOGS FILE
 

@@ -1,4 +1,4 @@
-"""Test that what strips, a validation and profiles say against a calibration is told in its verdict."""
+"""Tests that objections to a calibration by strips, a validation and profiles reach its verdict."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a user gives ``swath calibrate`` to look at: polygons and picked points, and mistakes in one line."""
+"""Tests the files that a user gives ``swath calibrate``: polygons and picked points, and mistakes in one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a calibration estimates, by a file and by options on top of it; mistakes in one line."""
+"""Tests what a calibration estimates by a file and by options that override it, and mistakes in one line."""
 
 from __future__ import annotations
 

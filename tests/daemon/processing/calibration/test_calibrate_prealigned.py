@@ -1,4 +1,4 @@
-"""What the pre-alignment says against the start of an angle that is held: it is told, and its sigma is doubted."""
+"""Tests that pre-alignment reports a contradiction to a held angle's start and enlarges its sigma."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def cast() -> Cast:
 
 
 def begun(cast: Cast, heading_off_deg: float) -> Flight:
-    """Start from an earlier calibration's file: the truth, but for a heading that is off and counts as known."""
+    """Start from an earlier calibration's file: the truth, except a heading that is wrong but counts as known."""
     sigmas = np.zeros(len(INDEX))
     sigmas[INDEX["kappa_rad"]] = KNOWN_RAD
     off = cast.truth.value("kappa_rad") + math.radians(heading_off_deg)
@@ -52,7 +52,10 @@ def begun(cast: Cast, heading_off_deg: float) -> Flight:
 
 
 def held_heading(flight: Flight) -> tuple[dict[str, float], Considered, tuple[Finding, ...]]:
-    """Adjust on the one level place nearest to the middle, which tells no heading; what is said against the start."""
+    """Adjust on the one level place nearest to the middle, which shows no heading.
+
+    Return by how much pre-alignment moved each parameter from its start, the held heading, and the findings.
+    """
     first, away = _aligned(flight, NOBODY)
     aligned = flight.placed(first)
     level = [plane for plane in find_planes(aligned).planes if plane.normal_t[2] > 0.9995]

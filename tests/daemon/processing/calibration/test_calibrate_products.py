@@ -1,4 +1,4 @@
-"""What stands in the head of a calibration file."""
+"""Tests the header of a calibration file."""
 
 from __future__ import annotations
 

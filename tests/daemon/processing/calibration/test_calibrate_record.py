@@ -1,4 +1,4 @@
-"""What configuration and navigation tell of the instruments, for a calibration's record."""
+"""Tests what configuration and navigation contribute about the instruments to a calibration's record."""
 
 from __future__ import annotations
 

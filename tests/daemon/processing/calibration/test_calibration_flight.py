@@ -1,4 +1,4 @@
-"""What a calibration keeps of a log: the ranges it adjusts are those that `swath georef` places."""
+"""Tests that a calibration adjusts the ranges that `swath georef` places."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Control as layers of GIS programs: GeoPackage and shapefile."""
+"""Tests control in layers of GIS programs: GeoPackage and shapefile."""
 
 from __future__ import annotations
 

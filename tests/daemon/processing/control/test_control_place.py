@@ -1,4 +1,4 @@
-"""Control on the earth: its CRS, its heights, and its place beside the flight's."""
+"""Tests control on the earth: its CRS, its heights, and its distance from the flight."""
 
 from __future__ import annotations
 

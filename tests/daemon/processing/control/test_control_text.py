@@ -1,4 +1,4 @@
-"""Control as text: the layouts of Trimble, Leica and plain files, and what is said about others."""
+"""Tests control as text: layouts of Trimble, Leica and plain files, and the refusal of others."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The place of a flight is found in a few seconds of its log."""
+"""Tests that the place of a flight is found in a few seconds of its log."""
 
 from __future__ import annotations
 

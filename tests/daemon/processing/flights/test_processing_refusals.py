@@ -1,4 +1,4 @@
-"""What cannot go together is refused in one line that names both files."""
+"""Tests that files which do not fit together are refused in one line that names both."""
 
 from __future__ import annotations
 

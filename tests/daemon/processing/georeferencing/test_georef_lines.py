@@ -1,4 +1,4 @@
-"""The lines that `swath georef` ends with, from the sidecar alone."""
+"""Tests the last lines of `swath georef`, from the sidecar alone."""
 
 from __future__ import annotations
 

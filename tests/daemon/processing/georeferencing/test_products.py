@@ -1,4 +1,4 @@
-"""What `swath georef` plans before it works."""
+"""Tests what `swath georef` plans before it works."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``swath history``: calibrations below folders as table, sentences, CSV and page."""
+"""Tests ``swath history``: calibrations below folders as table, sentences, CSV and page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``swath live``: live and replayed points are the same bytes; what it says of itself."""
+"""Tests ``swath live``: live and replayed points have the same bytes; its status is right."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class Flown:
         return Setup.of_log(self.session().attachments(), Options(uncertainty=False))
 
     def grow(self, folder: Path, seed: int) -> Iterator[None]:
-        """Write the same parts again, a piece at a time: the next part's head is there before this one's end."""
+        """Write the same parts again in pieces; the next part's head exists before this one's end."""
         lengths = random.Random(seed)
         session_id = self.session().session_id
         for number, path in enumerate(self.paths):
@@ -123,7 +123,7 @@ def replayed(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> tuple[Pa
 
 
 def follow_growing(flown: Flown, folder: Path, seed: int, monkeypatch: pytest.MonkeyPatch) -> list[Told]:
-    """Follow the flight while it is written anew; what was told."""
+    """Follow the flight while it is written again, and return the final status."""
     monkeypatch.setattr(live_module, "POLL_S", 0.0)
     monkeypatch.setattr(live_module, "STATUS_S", 0.05)
     monkeypatch.setattr(live_follow, "GONE_S", 1e9)

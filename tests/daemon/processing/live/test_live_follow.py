@@ -1,4 +1,4 @@
-"""What `swath live` follows, what it passes over, and when it says that there is no more."""
+"""Tests what `swath live` follows and skips, and when it reports the end."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `swath live` shows stands in metres and level, whatever the output counts in; all points end as they must."""
+"""Tests that `swath live` shows metres and level axes, whatever the output's unit."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``swath live`` beside a recorder, in real time: a virtual aircraft on wires, three processes, one log."""
+"""Tests ``swath live`` beside a recorder, in real time: a virtual aircraft on wires, three processes, one log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""End to end without a device's INS: wires, a recorder, ``swath live`` beside it; and the same log smoothed."""
+"""Tests wires, recorder and ``swath live`` end to end without a device's INS, and the same log smoothed."""
 
 from __future__ import annotations
 

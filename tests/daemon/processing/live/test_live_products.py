@@ -1,4 +1,4 @@
-"""What `swath live` writes for the eye: read back by others' readers, against numbers computed here."""
+"""Tests the pictures and messages of `swath live` with other readers, against numbers computed here."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Samples that are left out for their values or their stamps are holes of the trajectory where they last."""
+"""Tests that samples dropped for their values or stamps become gaps of the trajectory if they last."""
 
 from __future__ import annotations
 

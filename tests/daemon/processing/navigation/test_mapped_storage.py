@@ -1,4 +1,4 @@
-"""Navigation with its arrays in files: the same bytes as in memory, and memory given back."""
+"""Tests navigation with its arrays in files: the same bytes as in memory, and released memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A flight whose inertial unit has no clock that is known: the trajectory is where the truth is at GPS's times."""
+"""Tests a flight whose inertial unit has no known clock: the trajectory is at the truth at GPS times."""
 
 from __future__ import annotations
 

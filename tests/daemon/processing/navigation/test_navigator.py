@@ -1,4 +1,4 @@
-"""A growing log without a device's INS: the navigator's poses against the truth, and the same however it is fed."""
+"""Tests the navigator on a growing log without a device's INS: true poses, however it is fed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What navigation reads of a log: samples, positions, velocities and headings are the flight's, at their own time."""
+"""Tests what navigation reads of a log: samples, positions, velocities and headings at their own times."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An INS that tells the way of its antenna is found out, and one that does not is left alone."""
+"""Tests that an INS which gives its antenna's path is detected, and one that does not is accepted."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measures the texts of a drawn figure; reads pages as a person would, and names what no page may have."""
+"""Measures the texts of a drawn figure, reads pages as a person would, and names faults of pages."""
 
 from __future__ import annotations
 

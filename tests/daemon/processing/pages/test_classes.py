@@ -1,4 +1,4 @@
-"""Classes end at round numbers that follow from what is required."""
+"""Tests that classes end at round numbers that follow from the requirements."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every page has a head, tables without empty columns, an appendix and a PDF."""
+"""Tests that every page has a head, tables without empty columns, an appendix and a PDF."""
 
 from __future__ import annotations
 

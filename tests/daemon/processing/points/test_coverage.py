@@ -1,4 +1,4 @@
-"""The ground that points cover: areas of known shapes, holes, strips that overlap, other units."""
+"""Tests the ground that points cover: areas of known shapes, holes, overlapping strips, other units."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A log's messages into points: however the log is cut, and while it is still being written, the same bytes.
+"""Tests that a log's messages become the same points, however it is cut and while it grows.
 
 One short virtual flight with a line scanner and a spinning head beside each other, and the receiver's own INS.
 """

@@ -1,4 +1,4 @@
-"""Jobs: the same bytes in one process, in several and on a cluster; an index that gives each job its own chunks."""
+"""Tests jobs: the same bytes in one process, several and a cluster; an index gives each job its chunks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The proof: noiseless flights of every kind of scanner, georeferenced with the true trajectory and calibration.
+"""Tests noiseless flights of every kind of scanner, georeferenced with true trajectory and calibration.
 
 Every return within 1 mm and half the packet's own quanta (range, angle, time) carried to the ground; nothing else is
 allowed for. Each kind is flown once with the air off and once with it on: ranges as of vacuum, bent beams.

@@ -1,4 +1,4 @@
-"""Recordings of real heads through parser, geometry and sensor model, against the points of makers and other decoders.
+"""Tests recordings of real heads through parser, geometry and sensor model against other decoders' points.
 
 The body stands at a place on earth with an attitude; points_e come back to the head's frame by PROJ and SciPy. How far
 the others may be apart is what the parsers' own tests found: of the decoders' ways, not of this one.

@@ -1,4 +1,4 @@
-"""The space that a log's returns will take, estimated from a few of its chunks."""
+"""Tests the estimate of the space that a log's returns will take, from a few of its chunks."""
 
 from __future__ import annotations
 

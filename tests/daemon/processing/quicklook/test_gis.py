@@ -1,4 +1,4 @@
-"""`swath view --gis`: maps and features agree with the points, as GDAL reads them."""
+"""Tests `swath view --gis`: maps and features agree with the points, as GDAL reads them."""
 
 from __future__ import annotations
 

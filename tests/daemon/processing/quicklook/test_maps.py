@@ -1,4 +1,4 @@
-"""The pictures of a quick look: coordinates, colours and words are measured as they are drawn."""
+"""Tests the pictures of a quick look: coordinates, colours and words are measured as drawn."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A quick look's numbers against surfaces of closed form: every one of them was put in."""
+"""Tests a quick look's numbers against surfaces of closed form."""
 
 from __future__ import annotations
 

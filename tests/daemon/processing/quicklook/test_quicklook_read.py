@@ -1,4 +1,4 @@
-"""Files of points that are read otherwise than they are written: COPC's order, units of heights and sigmas."""
+"""Tests files of points read in another order or unit than written: COPC, heights and sigmas."""
 
 from __future__ import annotations
 

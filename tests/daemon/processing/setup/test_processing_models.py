@@ -1,4 +1,4 @@
-"""Models from tables: gimbals with logged angles, pulse rates nobody tells."""
+"""Tests models made from tables: gimbals with logged angles, pulse rates that no device reports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pulses in air from the wire to points: SREP with byte 15 = 255 against a flight that knows every echo's pulse.
+"""Tests pulses in air from the wire to points: SREP with byte 15 = 255 and the true pulse of every echo.
 
 1200 m above hills, two to four pulses in the air, a pulse rate that jitters, a tick that is no whole nanosecond, four
 pulses in ten without a return, lost datagrams. Truth is made here, with PROJ and SciPy.
@@ -108,12 +108,12 @@ class Flight:
 
     @property
     def came(self) -> BoolArray:
-        """(k,) whose record was not lost."""
+        """Return (k,) True where the echo's record was not lost."""
         return ~np.isin(self.record // PER_DATAGRAM, LOST)
 
     @property
     def known(self) -> BoolArray:
-        """(k,) whose emission was not lost either."""
+        """Return (k,) True where the echo's emission was not lost either."""
         return self.came & ~np.isin(self.pulse // PER_DATAGRAM, LOST)
 
 

@@ -1,4 +1,4 @@
-"""From a configuration to models, clocks and parsers; and every mistake in one line."""
+"""Tests the way from a configuration to models, clocks and parsers, and every mistake in one line."""
 
 from __future__ import annotations
 

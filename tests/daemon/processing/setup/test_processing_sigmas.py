@@ -1,4 +1,4 @@
-"""Are the sigmas honest? Returns of virtual flights, with errors drawn as large as said, against where the light went.
+"""Tests that sigmas are honest, with returns of virtual flights whose errors are drawn as stated.
 
 Each draw has its own errors of trajectory, calibration, range, angle and time, all constant over a strip but the last
 three; one return of it counts, so that draws are independent and the normalised squared error has three degrees of

@@ -1,4 +1,4 @@
-"""A coarse terrain model from a GeoTIFF."""
+"""Tests a coarse terrain model from a GeoTIFF."""
 
 from __future__ import annotations
 

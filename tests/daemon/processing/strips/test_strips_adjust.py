@@ -1,4 +1,4 @@
-"""``swath strips --adjust`` from a log to corrected trajectories: what one strip lacks is found."""
+"""Tests ``swath strips --adjust`` from a log to corrected trajectories: the error of one strip is found."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page of a navigated flight: whole in itself, and nothing that happened in between two pixels is lost."""
+"""Tests the page of a navigated flight: it is complete, and no event between two pixels is lost."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The verdict on a flight: what was put in is what is told, and what is sound is called good."""
+"""Tests the verdict on a flight: introduced faults are reported, and a sound flight is good."""
 
 from __future__ import annotations
 

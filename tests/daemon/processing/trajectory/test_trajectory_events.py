@@ -1,4 +1,4 @@
-"""Event marks: each has a row, with the pose of its time or the reason why not."""
+"""Tests that each event mark has a row, with the pose of its time or the reason for its absence."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The files of a trajectory: what is in them, where they go, and that a failure leaves nothing."""
+"""Tests the files of a trajectory: their contents and places, and that a failure leaves nothing."""
 
 from __future__ import annotations
 

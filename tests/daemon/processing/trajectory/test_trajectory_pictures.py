@@ -1,4 +1,4 @@
-"""The pictures of a navigated flight: coordinates, times and strips are measured as they are drawn."""
+"""Tests the pictures of a navigated flight: coordinates, times and strips are measured as drawn."""
 
 from __future__ import annotations
 

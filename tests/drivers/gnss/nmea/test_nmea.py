@@ -1,4 +1,4 @@
-"""NMEA on real recordings: counts, gpsd's values, every cut; and times, epochs and receivers without a fix."""
+"""Tests NMEA on real recordings: counts, gpsd's values, every cut, times, epochs, and receivers without a fix."""
 
 from __future__ import annotations
 

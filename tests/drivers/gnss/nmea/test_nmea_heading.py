@@ -1,4 +1,4 @@
-"""Headings in NMEA: THS, HPR, PASHR and PTNL,AVR, their quality, and which of them counts."""
+"""Tests headings in NMEA: THS, HPR, PASHR and PTNL,AVR, their quality, and which of them counts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""NovAtel OEM7: every real recording against NovAtel's own decoder, cut and damaged in all ways."""
+"""Tests NovAtel OEM7: every real recording against NovAtel's own decoder, cut and damaged in all ways."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""NovAtel logs written by the encoder and read back: what no recording has, and what broken or odd input does."""
+"""Tests NovAtel logs written by the encoder: messages without a recording, and broken or odd input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""NovAtel ASCII logs: the same records as of the binary ones that novatel-edie wrote them from; framing, bad fields."""
+"""Tests NovAtel's ASCII logs: the records of the binary logs that novatel-edie converted, framing, bad fields."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SBF on real recordings: pysbf2's values, every cut and damage; what the blocks say of time."""
+"""Tests SBF on real recordings: pysbf2's values, every cut and damage, and the time in the blocks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SBF written by the encoder, and by hand where no library decodes a block: what no recording has, and odd input."""
+"""Tests SBF by its encoder, or by hand where no library decodes a block: blocks without a recording, odd input."""
 
 from __future__ import annotations
 

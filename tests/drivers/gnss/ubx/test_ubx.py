@@ -1,4 +1,4 @@
-"""UBX on real recordings: pyubx2's and gpsd's values, every cut; leap seconds, weeks, epochs, pulses, marks."""
+"""Tests UBX on real recordings: pyubx2's and gpsd's values, every cut, leap seconds, weeks, epochs, pulses, marks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""UBX without NAV-PVT: older messages, NMEA in the stream, and receivers with inertial sensors."""
+"""Tests UBX without NAV-PVT: older messages, NMEA in the stream, and receivers with inertial sensors."""
 
 from __future__ import annotations
 

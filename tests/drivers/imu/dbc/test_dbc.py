@@ -1,4 +1,4 @@
-"""Protocol ``dbc``: samples out of frames whatever the batches, counters, PPS latch, settings and bad input."""
+"""Tests protocol ``dbc``: samples from frames in any batches, counters, PPS latch, settings and bad input."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Frames of the encoder, read by cantools with each unit's DBC and by the parser; what does not fit is refused."""
+"""Tests the encoder's frames with cantools, each unit's DBC and the parser; other values are refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Signals cut out of frames, against cantools: random signals, and every DBC of the fixtures."""
+"""Tests signals cut out of frames against cantools: random signals, and every DBC of the fixtures."""
 
 from __future__ import annotations
 

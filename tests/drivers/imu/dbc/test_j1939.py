@@ -1,4 +1,4 @@
-"""J1939 by a DBC: messages by PGN, the choice of the device, values that are none; DBC files as users have them."""
+"""Tests J1939 by a DBC: messages by PGN, choice of the device, unavailable values, and users' DBC files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The Hesai models with their recordings, and packets of them made by the encoder."""
+"""Provides the Hesai models with their recordings, and packets of them made by the encoder."""
 
 from __future__ import annotations
 

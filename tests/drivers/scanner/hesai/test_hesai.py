@@ -1,4 +1,4 @@
-"""Hesai heads: the manuals' figures, every return mode, damage on the wire, GPS data packets."""
+"""Tests Hesai heads: the manuals' figures, every return mode, damage on the wire, GPS data packets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Hesai heads: real recordings in dual return, against nebula's clouds."""
+"""Tests Hesai heads with real recordings in dual return against nebula's clouds."""
 
 from __future__ import annotations
 

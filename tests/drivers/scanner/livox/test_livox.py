@@ -1,4 +1,4 @@
-"""Livox packets: bytes and points computed by hand, every type of points and of time, cut and damaged.
+"""Tests Livox packets: bytes and points computed by hand, every type of point and time, cut and damaged.
 
 No recording exists in the collection. The time of the first packet and its form are those of a report by a user
 (Livox-SDK #130: "21-6-8 8:1661272021"); figures are computed by hand or by `datetime`.

@@ -1,4 +1,4 @@
-"""Ouster: real recordings against the maker's own decoder, the manual's formula, and packets damaged on the wire."""
+"""Tests Ouster: real recordings against the maker's own decoder, the manual's formula, and damaged packets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ouster's metadata: both forms of real files, and everything that is refused, in one line each."""
+"""Tests Ouster's metadata: both forms of real files, and every refusal in one line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Ouster: the maker's digests of fields as they lie in packets and in frames, and its poses of three frames."""
+"""Tests Ouster: the maker's digests of fields in packets and in frames, and its poses of three frames."""
 
 from __future__ import annotations
 

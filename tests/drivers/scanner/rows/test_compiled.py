@@ -1,4 +1,4 @@
-"""Compiled loops write what `ReturnSlots.fill` writes, byte for byte."""
+"""Tests that compiled loops write what `ReturnSlots.fill` writes, byte for byte."""
 
 from __future__ import annotations
 

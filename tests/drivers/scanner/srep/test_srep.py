@@ -1,4 +1,4 @@
-"""SREP: the page's test vector both ways, against a decoder written from the page, and damaged on the wire."""
+"""Tests SREP: the page's test vector both ways, a decoder written from the page, and damage on the wire."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SREP for who looks for the emissions of echoes: pulses without a return, and the rates that headers tell."""
+"""Tests SREP for resolving emissions of echoes: pulses without a return, and the rates in headers."""
 
 from __future__ import annotations
 

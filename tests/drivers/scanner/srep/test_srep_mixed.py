@@ -1,4 +1,4 @@
-"""SREP datagrams of mixed lengths decoded at once: what they give one by one, whatever is wrong with some of them."""
+"""Tests SREP datagrams of mixed lengths decoded at once, compared with one by one, with all kinds of errors."""
 
 from __future__ import annotations
 

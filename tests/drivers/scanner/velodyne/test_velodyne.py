@@ -1,4 +1,4 @@
-"""VLP-16: real recordings against two other decoders, the manual's figures, and packets damaged on the wire."""
+"""Tests VLP-16: real recordings against two other decoders, the manual's figures, and damaged packets."""
 
 from __future__ import annotations
 

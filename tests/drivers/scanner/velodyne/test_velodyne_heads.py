@@ -1,4 +1,4 @@
-"""Velodyne heads beside the VLP-16: a real VLP-32C against other decoders, the manuals' figures, calibration files."""
+"""Tests other Velodyne heads: a real VLP-32C against other decoders, the manuals' figures, calibration files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""CAN through python-can on real multicast and a real pty; SocketCAN as far as a kernel without CAN goes."""
+"""Tests CAN with python-can on real multicast and a real pty; SocketCAN as far as possible without a CAN kernel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PPS sources: `fixed:` whole on real files and FIFOs, the kernel's and DCD as far as a machine without them goes."""
+"""Tests PPS sources: `fixed:` completely on real files and FIFOs, the kernel's and DCD without their hardware."""
 
 from __future__ import annotations
 

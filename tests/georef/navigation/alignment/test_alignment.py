@@ -1,4 +1,4 @@
-"""Starts against truth: of flights that were made without this code, and of `sim`'s unit at the ends of the earth."""
+"""Tests alignment against truth: flights made without this code, and the simulator's unit near the poles."""
 
 from __future__ import annotations
 

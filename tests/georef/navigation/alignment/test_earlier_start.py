@@ -1,4 +1,4 @@
-"""A start brought back: where the truth was, by a motion that is exact, with sigmas that hold."""
+"""Tests a start moved back in time: it agrees with the truth of an exact motion, and its sigmas hold."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The transition of errors and each derivative of an observation against differences of what is not linear."""
+"""Tests the errors' transition and observation derivatives against differences of the nonlinear equations."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The filter: on the reference flights, cut anywhere, with bad input, for hours, and what becomes of observations."""
+"""Tests the filter: the reference flights, any cuts, bad input, hours of input, and the fates of observations."""
 
 from __future__ import annotations
 

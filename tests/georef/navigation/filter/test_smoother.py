@@ -1,4 +1,4 @@
-"""The smoother: against Rauch, Tung and Striebel's own formulas, on the reference flights, and smooth between nodes."""
+"""Tests the smoother: the formulas of Rauch, Tung and Striebel, reference flights, smoothness between nodes."""
 
 from __future__ import annotations
 

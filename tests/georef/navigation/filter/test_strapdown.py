@@ -1,4 +1,4 @@
-"""Strapdown against the simulator's exact motions, coning in closed form, Schuler's period, and pyins."""
+"""Tests the strapdown against the simulator's exact motions, coning in closed form, Schuler's period, and pyins."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The page of a planned calibration: numbers have units and stand clear of lines and of each other."""
+"""Tests the page of a planned calibration: numbers have units and do not overlap lines or each other."""
 
 from __future__ import annotations
 
