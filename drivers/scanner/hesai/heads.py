@@ -21,6 +21,7 @@ from swath.georef.records import RETURN_FLAG_LAST, RETURN_FLAG_STRONGEST
 Fields: TypeAlias = tuple[tuple[str, object], ...]
 
 FIRST_ROUND, LAST_ROUND = 0, -1
+NEAR_MM = 2_850
 
 # bits of the header's flags, and what they add to a packet (udp_protocol_header.h of HesaiLidar_SDK_2.0)
 SEQUENCE, IMU, SAFETY, SIGNATURE, CONFIDENCE, WEIGHT, LIGHT = (1 << bit for bit in range(7))
@@ -63,6 +64,7 @@ HEADER: Fields = (
     ("flags", "u1"),
 )
 BLOCK: Fields = (("azimuth", "<u2"),)
+SOP, BLOCK_SOP = 0xFFEE, 0xEEFF
 
 
 @dataclass(frozen=True)
@@ -83,10 +85,16 @@ class HesaiHead:
         offset_ns: (states, channels) firing times after the reading of the azimuth.
         beams: design values; a device's own values are in its angle correction file.
         channel_bytes: bytes of a return without those that the flags add.
-        checked: whether a CRC follows the body, and one the tail.
+        has_crc: whether a CRC follows the body, and one the tail.
+        checks_crc: whether it is known which CRC that is, so that packets with a wrong one are refused.
         units_mm: units of distance that it may send.
         modes: return modes that it may send.
         states: makes the (n, rounds) rows of ``offset_ns`` that apply to the rounds of packets; None: the only one.
+        near_ns: (states, channels) firing times of lasers whose farthest return is nearer than `NEAR_MM`.
+        pace: makes the (n,) multiples of ``round_ns`` between the rounds of packets; None: 1.
+        header, block: fields of the header and at the beginning of a block; empty where the packet has no header.
+        year_base: year from which the date counts; from 1900, a year byte of 0 says that seconds since 1970 follow.
+        least_range: smaller raw ranges are codes of the head, not distances.
     """
 
     name: str
@@ -103,10 +111,17 @@ class HesaiHead:
     protocol_minor: int = 1
     optional: int = 0
     channel_bytes: int = 4
-    checked: bool = False
+    has_crc: bool = False
+    checks_crc: bool = False
     units_mm: tuple[int, ...] = (4,)
     modes: tuple[int, ...] = USUAL_MODES
     states: Callable[[StructArray, int], Int64Array] | None = field(default=None, compare=False)
+    near_ns: Int64Array | None = field(default=None, compare=False)
+    pace: Callable[[StructArray], Int64Array] | None = field(default=None, compare=False)
+    header: Fields = HEADER
+    block: Fields = BLOCK
+    year_base: int = 1900
+    least_range: int = 1
 
     def packet_dtype(self, flags: int | None = None) -> np.dtype[np.void]:
         """Return the dtype of a point cloud packet with these flags (None: the usual ones)."""
@@ -120,16 +135,16 @@ class HesaiHead:
                 "itemsize": self.channel_bytes + more,
             }
         )
-        block = np.dtype([*BLOCK, ("returns", channel, (self.channels,))])
-        fields: list[tuple[str, object]] = [*HEADER]
+        block = np.dtype([*self.block, ("returns", channel, (self.channels,))])
+        fields: list[tuple[str, object]] = [*self.header]
         fields.append(("blocks", block, (self.blocks,)))  # type: ignore[arg-type]
         for name, kind, there in (
-            ("body_crc", "<u4", self.checked),
+            ("body_crc", "<u4", self.has_crc),
             ("safety", f"V{SAFETY_BYTES}", flags & SAFETY),
             *((name, kind, True) for name, kind in self.tail),
             ("sequence", "<u4", flags & SEQUENCE),
             ("imu", f"V{IMU_BYTES}", flags & IMU),
-            ("tail_crc", "<u4", self.checked),
+            ("tail_crc", "<u4", self.has_crc),
             ("signature", f"V{SIGNATURE_BYTES}", flags & SIGNATURE),
         ):
             if there:
@@ -154,11 +169,24 @@ class HesaiHead:
         start: Int64Array = np.rint(number * self.round_ns).astype(np.int64) + self.start_ns
         return start
 
+    def rounds_ns(self, packets: StructArray, rounds: int) -> Int64Array:
+        """Return times from the packet's time to the reading of each round's azimuth: (1, rounds) or (n, rounds)."""
+        start = self.round_start_ns(rounds)[np.newaxis]
+        if self.pace is None:
+            return start
+        paced: Int64Array = (start - self.start_ns) * self.pace(packets)[:, np.newaxis] + self.start_ns
+        return paced
+
     def firing_ns(self, packets: StructArray, rounds: int) -> Int64Array:
         """Return times of firings after the reading of the azimuth: (1, channels), or (n · rounds, channels)."""
         if self.states is None:
             return self.offset_ns
-        times: Int64Array = self.offset_ns[self.states(packets, rounds).reshape(-1)]
+        states = self.states(packets, rounds).reshape(-1)
+        times: Int64Array = self.offset_ns[states]
+        if self.near_ns is not None:
+            ranges = packets["blocks"]["returns"]["range"].reshape(len(states), -1, self.channels).max(axis=1)
+            unit_mm = np.repeat(packets["distance_unit_mm"], rounds)[:, np.newaxis]
+            times = np.where(ranges.astype(np.int64) * unit_mm < NEAR_MM, self.near_ns[states], times)
         return times
 
     def last_ns(self, mode: int) -> int:

@@ -214,7 +214,8 @@ QT128 = HesaiHead(
     offset_ns=np.stack([_qt128_loop(_QT128_LOOP_1), _qt128_loop(_QT128_LOOP_2)]),
     beams=beam_table(numbers(_QT128_ELEVATION_DEG), azimuth_deg=numbers(_QT128_AZIMUTH_DEG)),
     channel_bytes=3,
-    checked=True,
+    has_crc=True,
+    checks_crc=True,
     modes=(*USUAL_MODES, MODE_SECOND, MODE_FIRST_SECOND, MODE_STRONGEST_SECOND),
     states=_qt128_states,
 )

@@ -23,16 +23,19 @@ from swath.drivers.parser import DeviceSettings, PacketParser, Parser
 from swath.drivers.scanner.beams import BeamTable
 from swath.drivers.scanner.hesai.gps import GPS_BYTES, NS, GpsReader
 from swath.drivers.scanner.hesai.heads import (
+    BLOCK_SOP,
     MODE_STRONGEST,
     SEQUENCE,
     SEVERAL_NAMES,
     SINGLE_FLAGS,
+    SOP,
     HesaiHead,
     Layout,
     echoes_of,
     read_angle_file,
 )
 from swath.drivers.scanner.hesai.models import QT64, QT128, XT16, XT32, XT32M2X
+from swath.drivers.scanner.hesai.pandar import OT128, PANDAR40P, PANDAR64, PANDAR128
 from swath.drivers.scanner.rows.filler import filler
 from swath.drivers.scanner.rows.slots import Chosen
 from swath.drivers.scanner.sequence import SampleThinner, SequenceTracker
@@ -49,7 +52,6 @@ from swath.georef.records import (
     TimeMessage,
 )
 
-SOP = 0xFFEE
 FULL_CIRCLE = 36_000  # azimuth in 0.01°
 MAX_MICROSECOND = 1_999_999  # the manuals' range ends at 1 000 000; a head may count on until a late edge
 _UTC = np.dtype([(name, "u1") for name in ("year", "month", "day", "hour", "minute", "second")])
@@ -83,7 +85,7 @@ def encode_point_packet(
     """
     flags = head.flags & ~SEQUENCE | (0 if sequence is None else SEQUENCE)
     packet = np.zeros(1, dtype=head.packet_dtype(flags))
-    utc = bytes((time.year - 1900, time.month, time.day, time.hour, time.minute, time.second))
+    utc = bytes((time.year - head.year_base, time.month, time.day, time.hour, time.minute, time.second))
     fields: dict[str, object] = {
         "sop": SOP,
         "protocol_major": head.protocol_major,
@@ -101,7 +103,10 @@ def encode_point_packet(
         **(tail or {}),
     }
     for name, value in fields.items():
-        packet[name] = value
+        if name in (packet.dtype.names or ()):
+            packet[name] = value
+    if ("sop", "<u2") in head.block:
+        packet["blocks"]["sop"] = BLOCK_SOP
     packet["blocks"]["azimuth"] = azimuth_0p01deg
     packet["blocks"]["returns"]["range"], packet["blocks"]["returns"]["reflectivity"] = range_raw, reflectivity
     if sequence is not None:
@@ -172,7 +177,7 @@ class HesaiParser(PacketParser):
             return []
         layout = self._layouts[length]
         packets = units.view(layout.dtype)[:, 0]
-        second_ns = NS * _utc_seconds(packets)
+        second_ns = NS * _utc_seconds(packets, self._head)
         good = self._check(packets, self._checksums_hold(units, layout), layout)
         self.counters.messages["points"] += int(good.sum())
         self.counters.bytes_framed += int(good.sum()) * length
@@ -193,7 +198,7 @@ class HesaiParser(PacketParser):
     def _checksums_hold(self, units: ByteRows, layout: Layout) -> BoolArray:
         """Return (n,) False for packets of this head whose CRCs are wrong; they are counted."""
         holds = np.ones(len(units), dtype=np.bool_)
-        for start, at in checked_parts(layout.dtype):
+        for start, at in checked_parts(layout.dtype) if self._head.checks_crc else []:
             stated = np.ascontiguousarray(units[:, at : at + 4]).view("<u4")[:, 0].tolist()
             for row in np.flatnonzero(holds).tolist():
                 holds[row] = mpeg_2(units[row, start:at].data) == stated[row]
@@ -205,28 +210,37 @@ class HesaiParser(PacketParser):
     def _check(self, packets: StructArray, good: BoolArray, layout: Layout) -> BoolArray:
         """Return (n,) True for good packets of this model that can be decoded; the others are counted by error."""
         head, utc = self._head, packets["utc"].copy().view(_UTC)
+        counts_seconds = (utc["year"] == 0) & (head.year_base == 1900)
         for code, passes in (
-            ("bad_header", packets["sop"] == SOP),
-            ("wrong_product", packets["protocol_major"] == head.protocol_major),
+            ("bad_header", self._starts(packets)),
+            ("wrong_product", _stated(packets, "protocol_major", head.protocol_major) == head.protocol_major),
             (
                 "bad_header",
-                (packets["laser_num"] == head.channels)
-                & (packets["block_num"] == head.blocks)
-                & np.isin(packets["distance_unit_mm"], head.units_mm)
-                & layout.fits[packets["flags"]],
+                (_stated(packets, "laser_num", head.channels) == head.channels)
+                & (_stated(packets, "block_num", head.blocks) == head.blocks)
+                & np.isin(_stated(packets, "distance_unit_mm", head.units_mm[0]), head.units_mm)
+                & (layout.fits[packets["flags"]] if "flags" in (packets.dtype.names or ()) else np.True_),
             ),
             ("bad_return_mode", np.isin(packets["mode"], head.modes)),
             ("bad_azimuth", (packets["blocks"]["azimuth"] < FULL_CIRCLE).all(axis=1)),
             (
                 "bad_time",
                 (packets["microsecond"] <= MAX_MICROSECOND)
-                & ((utc["year"] == 0) | (_within(utc["month"], 1, 12) & _within(utc["day"], 1, 31)))
-                & ((utc["year"] == 0) | ((utc["hour"] < 24) & (utc["minute"] < 60) & (utc["second"] <= 60))),
+                & (counts_seconds | (_within(utc["month"], 1, 12) & _within(utc["day"], 1, 31)))
+                & (counts_seconds | ((utc["hour"] < 24) & (utc["minute"] < 60) & (utc["second"] <= 60))),
             ),
         ):
             self._refuse(code, int((good & ~passes).sum()), packets.dtype.itemsize)
             good &= passes
         return good
+
+    def _starts(self, packets: StructArray) -> BoolArray:
+        """Return (n,) True for packets that begin, or whose blocks all begin, with their mark."""
+        if "sop" in (packets.dtype.names or ()):
+            header: BoolArray = packets["sop"] == SOP
+            return header
+        blocks: BoolArray = (packets["blocks"]["sop"] == BLOCK_SOP).all(axis=1)
+        return blocks
 
     def _refuse(self, code: str, count: int, length: int) -> None:
         if count:
@@ -255,7 +269,7 @@ class HesaiParser(PacketParser):
         records: list[Record] = [DeviceClockSamples(clock)] if len(clock) else []
         if self._thinner is None:
             rows = returns_of_packets(
-                packets["mode"].astype(np.uint16) << 8 | packets["distance_unit_mm"],
+                packets["mode"].astype(np.uint16) << 8 | _stated(packets, "distance_unit_mm", self._head.units_mm[0]),
                 self._head.blocks * self._head.channels,
                 lambda part: self._firings(host_time_ns[part], packets[part], stamp_ns[part], number[part]),
                 self._fill,
@@ -288,11 +302,15 @@ class HesaiParser(PacketParser):
         echoes = echoes_of(mode)
         azimuth = packets["blocks"]["azimuth"][:, ::echoes]
         rounds = azimuth.shape[1]
-        round_ns = (stamp_ns[:, np.newaxis] + head.round_start_ns(rounds)).reshape(-1, 1)
+        round_ns = (stamp_ns[:, np.newaxis] + head.rounds_ns(packets, rounds)).reshape(-1, 1)
         firing_ns = head.firing_ns(packets, rounds)
+        returns = packets["blocks"]["returns"]
+        if head.least_range > 1:
+            returns = returns.copy()
+            returns["range"] *= returns["range"] >= head.least_range
         return Firings(
-            returns=packets["blocks"]["returns"],
-            range_unit_m=int(packets["distance_unit_mm"][0]) * 1e-3,
+            returns=returns,
+            range_unit_m=int(_stated(packets, "distance_unit_mm", head.units_mm[0])[0]) * 1e-3,
             host_time_ns=host_time_ns,
             number=number,
             most=head.blocks * head.channels,
@@ -324,18 +342,27 @@ def _azimuths(
     return made_of
 
 
+def _stated(packets: StructArray, name: str, usual: int) -> ByteArray:
+    """Return a field (n,) of the header, or the value of a head that does not state it."""
+    if name in (packets.dtype.names or ()):
+        stated: ByteArray = packets[name]
+        return stated
+    return np.full(len(packets), usual, dtype=np.uint8)
+
+
 def _within(value: ByteArray, least: int, most: int) -> BoolArray:
     inside: BoolArray = (value >= least) & (value <= most)
     return inside
 
 
-def _utc_seconds(packets: StructArray) -> Int64Array:
+def _utc_seconds(packets: StructArray, head: HesaiHead) -> Int64Array:
     """Return seconds since 1970 (n,) of the packets' date and time.
 
     The bytes are year minus 1900 and five more; or, as the maker's SDK reads a first byte of 0, seconds since 1970 in
     the last four, the highest first (udp_protocol_v6_1.h, GetMicroLidarTimeU64). Bytes that are not a date give an
     arbitrary time. The SDK counts a PandarQT's year from 2000 or from 1900 (udp_protocol_v3_1.h; the manual does not
-    say), and subtracts a century from an XT's year from 200 on: so only its last two digits count, as 1970 to 2069.
+    say), and subtracts a century from an XT's year from 200 on: so only its last two digits count, as 1970 to 2069. A
+    Pandar40P and Pandar64 count it from 2000, so that 0 is a year (udp_protocol_p40.h).
     """
     raw = packets["utc"].copy()
     utc = raw.view(_UTC)
@@ -344,7 +371,7 @@ def _utc_seconds(packets: StructArray) -> Int64Array:
     days = (month.astype("M8[D]") + (utc["day"].astype(np.int64) - 1)).astype(np.int64)
     of_day = (utc["hour"].astype(np.int64) * 60 + utc["minute"]) * 60 + utc["second"]
     counted = raw.view(np.dtype([("zero", "V2"), ("seconds", ">u4")]))["seconds"].astype(np.int64)
-    return np.where(utc["year"] == 0, counted, days * 86_400 + of_day)
+    return np.where((utc["year"] == 0) & (head.year_base == 1900), counted, days * 86_400 + of_day)
 
 
 def _maker(head: HesaiHead, *, clock_only: bool) -> Callable[[DeviceSettings], Parser]:
@@ -373,4 +400,8 @@ DRIVERS = (
     _driver("hesai-xt32m2x", XT32M2X),
     _driver("hesai-qt64", QT64),
     _driver("hesai-qt128", QT128),
+    _driver("hesai-pandar40p", PANDAR40P),
+    _driver("hesai-pandar64", PANDAR64),
+    _driver("hesai-pandar128", PANDAR128),
+    _driver("hesai-ot128", OT128),
 )
