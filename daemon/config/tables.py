@@ -187,6 +187,9 @@ class ImuConfig(Section):
         None,
         description="sbg-ellipse, sbg-ecom: the Sync In that PPS is wired to; its event holds the latched counter",
     )
+    altitude: Literal["geoid", "ellipsoid"] = Field(
+        "geoid", description="oxts-ncom: what the unit's altitude counts from, by its own configuration"
+    )
     rate_hz: float = Field(200.0, gt=0.0, le=100_000.0, description="nominal sample rate")
     rotation_b_imu: Matrix = Field(
         default_factory=_identity,

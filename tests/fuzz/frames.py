@@ -12,6 +12,7 @@ import numpy as np
 from swath.drivers.framing import kinds as frame_kinds
 from swath.drivers.framing.checksums import crc16_ccitt, crc24q, crc32_novatel, nmea_xor, ubx_fletcher
 from swath.drivers.framing.framer import FrameKind, Framer
+from swath.drivers.imu import oxts_ncom
 from swath.drivers.imu.microstrain import wire as microstrain
 from swath.drivers.imu.sbg_ecom import wire as sbg_ecom
 from swath.drivers.imu.vectornav import wire as vectornav
@@ -22,7 +23,7 @@ from tests.fuzz.mutation import LARGEST_CASE_BYTES, bounds, damage
 
 KINDS: dict[str, FrameKind] = {
     kind.name: kind
-    for module in (frame_kinds, microstrain, sbg_ecom, vectornav)
+    for module in (frame_kinds, microstrain, oxts_ncom, sbg_ecom, vectornav)
     for kind in vars(module).values()
     if isinstance(kind, FrameKind)
 }
@@ -119,6 +120,15 @@ def _seal_sbg_ecom(frame: bytes) -> bytes:
     return sbg_ecom.encode_frame(frame[2] if frame[2:3] else 44, frame[6:-3][: sbg_ecom.MAX_DATA_BYTES], kind)
 
 
+def _seal_ncom(frame: bytes) -> bytes:
+    packet = bytearray(b"\xe7" + frame[1:71].ljust(70, b"\0")) + b"\0"
+    if packet[oxts_ncom.STATUS_AT] not in oxts_ncom.PUBLIC:
+        packet[oxts_ncom.STATUS_AT] = oxts_ncom.LOCKED
+    for at in (oxts_ncom.CHECKSUM_1, oxts_ncom.CHECKSUM_2, 71):
+        packet[at] = oxts_ncom.checksum(packet, at)
+    return bytes(packet)
+
+
 SEALS: dict[str, Callable[[bytes], bytes]] = {
     "nmea": _seal_nmea,
     "ubx": _seal_ubx,
@@ -132,6 +142,7 @@ SEALS: dict[str, Callable[[bytes], bytes]] = {
     "vectornav": _seal_vectornav,
     "mip": _seal_mip,
     "sbg-ecom": _seal_sbg_ecom,
+    "ncom": _seal_ncom,
 }
 """Length and checksum of a frame made right, whatever is in it; by the name of its kind."""
 

@@ -80,7 +80,7 @@ def heading(state: int = 0x40) -> bytes:
 
 
 def flight() -> bytes:
-    """Two seconds of a unit's logs: the fixture, from which other inputs are made by mutation."""
+    """Return two seconds of a unit's logs: the fixture, from which other inputs are made by mutation."""
     pieces = [encode_log(wire.STATUS, 0, 3, 0, 0xFFFF, 0x0F, more=bytes(11)), b"$PSBGI,0*00\r\n"]
     for cycle in range(100):
         stamp_us = 4_294_000_000 + 20_000 * cycle  # wraps
