@@ -12,13 +12,13 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Literal
 
-from swath.drivers.parser import ChosenRecords, DeviceKind, DeviceSettings, Parser
+from swath.drivers.parser import ChosenRecords, DeviceKind, DeviceSettings, Parser, RawParser
 from swath.georef.records import EventMark, GnssFix, GnssHeading, NamesEdge, TimeMessage
 
 if TYPE_CHECKING:
     from swath.drivers.startup import StartupMessage, StartupOptions
 
-TransportKind = Literal["serial", "can", "udp", "tcp", "gnss", "imu", "ntrip"]
+TransportKind = Literal["serial", "can", "udp", "tcp", "gnss", "imu", "raw", "ntrip"]
 
 STREAM_TRANSPORTS: tuple[TransportKind, ...] = ("serial", "udp", "tcp")  # every wire that carries a byte stream
 
@@ -29,7 +29,9 @@ FOLDERS: dict[DeviceKind, tuple[str, ...]] = {  # where drivers of a kind are de
     "imu": ("imu", "gnss"),
     "scanner": ("scanner",),
     "corrections": ("corrections",),
+    "raw": (),
 }
+RAW = "raw"  # the protocol of a device that no driver reads; any kind may have it
 
 
 RECEIVER_RECORDS = (TimeMessage, GnssFix, GnssHeading, EventMark)
@@ -74,12 +76,14 @@ def find_driver(kind: DeviceKind, protocol: str) -> Driver:
     Raises:
         UnknownProtocolError: the protocol is unknown; the text names those that were probably meant, or all known ones.
     """
+    if protocol == RAW:
+        return raw_driver(kind)
     drivers = all_drivers(kind)
     try:
         return drivers[protocol]
     except KeyError:
         meant = probable_protocols(protocol, drivers)
-        known = f"did you mean {' or '.join(meant)}?" if meant else f"there are: {', '.join(sorted(drivers))}"
+        known = f"did you mean {' or '.join(meant)}?" if meant else f"there are: {', '.join(sorted([*drivers, RAW]))}"
         raise UnknownProtocolError(f"unknown {kind} protocol {protocol!r}; {known}") from None
 
 
@@ -163,6 +167,21 @@ class Driver:
     eight_bit_intensity: bool = False
     past_hour: bool = False
     startup: Callable[[DeviceSettings, StartupOptions], tuple[StartupMessage, ...]] | None = None
+
+
+@cache
+def raw_driver(kind: DeviceKind) -> Driver:
+    """Return the driver of any device of a kind that is recorded as it comes, to be read later by a driver of its
+    own.
+    """
+    return Driver(
+        protocol=RAW,
+        kind=kind,
+        transports=(*STREAM_TRANSPORTS, "can", "ntrip"),
+        yields=(),
+        summary="any device, recorded as it comes and counted; no driver reads it",
+        make_parser=RawParser,
+    )
 
 
 def receiver_inside(unit: Driver, make_parser: Callable[[DeviceSettings], Parser] | None = None) -> Driver:

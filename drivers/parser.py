@@ -21,7 +21,7 @@ from swath.georef.records import ByteRows, Chunk, ChunkBatch, Record
 if TYPE_CHECKING:
     pass
 
-DeviceKind = Literal["gnss", "imu", "scanner", "corrections"]
+DeviceKind = Literal["gnss", "imu", "scanner", "corrections", "raw"]
 
 
 class DriverSettingsError(ValueError):
@@ -133,6 +133,32 @@ class PacketParser(Parser):
             host_time_ns: (n,) host time of each unit.
             units: (n, length) uint8, one row a unit, possibly strided.
         """
+
+
+class RawParser(StreamParser):
+    """Counts the units of a device that no driver reads: each is a whole message, and none is a record.
+
+    Args:
+        settings: of the device; nothing of them is used.
+    """
+
+    def __init__(self, settings: DeviceSettings) -> None:
+        super().__init__()
+        del settings
+
+    def feed(self, chunk: Chunk) -> list[Record]:
+        """Count one unit."""
+        self.counters.bytes += len(chunk.data)
+        self.counters.bytes_framed += len(chunk.data)
+        self.counters.messages["unit"] += 1
+        return []
+
+    def feed_batch(self, batch: ChunkBatch) -> list[Record]:
+        """Count units of equal length."""
+        self.counters.bytes += batch.units.size
+        self.counters.bytes_framed += batch.units.size
+        self.counters.messages["unit"] += len(batch.units)
+        return []
 
 
 class ChosenRecords(Parser):

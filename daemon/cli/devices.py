@@ -29,9 +29,10 @@ def command(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
     """List the supported protocols: their transports, their records and the configuration keys they need."""
-    from swath.drivers.driver import KINDS, all_drivers
+    from swath.drivers.driver import KINDS, all_drivers, raw_driver
 
     listed = [describe_driver(driver) for kind in KINDS for driver in all_drivers(kind).values()]
+    listed.append(describe_driver(raw_driver("raw")))
     if as_json:
         print(json.dumps({"devices": listed}, indent=2))
         return
@@ -52,7 +53,7 @@ def _print_table(listed: list[dict[str, Any]]) -> None:
         first = row["kind"] if row["kind"] != kind else ""
         kind = row["kind"]
         what = Text(row["summary"])
-        what.append("\nyields " + ", ".join(row["yields"]), style="dim")
+        what.append("\nyields " + (", ".join(row["yields"]) or "no records"), style="dim")
         if row["needs"]:
             what.append("\nneeds " + ", ".join(row["needs"]), style="yellow")
         table.add_row(first, row["protocol"], ", ".join(row["transports"]), what)

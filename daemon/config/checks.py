@@ -19,8 +19,8 @@ from pydantic import BaseModel
 
 from swath.daemon.config.config import Config, DeviceTable
 from swath.daemon.config.rotations import rotation_problem
-from swath.daemon.config.tables import CorrectionsConfig, GnssConfig, ScannerConfig
-from swath.drivers.driver import Driver, UnknownProtocolError, find_driver
+from swath.daemon.config.tables import CorrectionsConfig, GnssConfig, ImuConfig, RawConfig, ScannerConfig
+from swath.drivers.driver import RAW, Driver, UnknownProtocolError, find_driver
 from swath.drivers.parser import DeviceKind, DriverSettingsError
 from swath.drivers.startup import StartupOptions
 from swath.drivers.transports.spec import TransportSpec, parse_pps, parse_transport
@@ -114,6 +114,8 @@ def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTabl
     section = f"{kind}.{name}"
     if isinstance(table, CorrectionsConfig):
         yield from _check_forwarding(config, section, table)
+    elif isinstance(table, RawConfig):
+        pass
     elif table.pps is not None and table.pps not in config.pps:
         known = ", ".join(config.pps) or "none; add [pps.main]"
         yield f'{section}.pps: got "{table.pps}", want the name of a [pps.<name>]; there are: {known}'
@@ -192,11 +194,14 @@ def _check_transport(config: Config, section: str, table: DeviceTable, driver: D
     except ValueError as error:
         yield f"{section}.{error}"
     else:
-        carriers = config.gnss if spec.kind == "gnss" else config.imu
+        tables: dict[str, Mapping[str, DeviceTable]] = {"gnss": config.gnss, "imu": config.imu, "raw": config.raw}
+        carriers = tables.get(spec.kind, {})
         got = f'{section}.transport: got "{table.transport}"'
         if spec.carrier is not None and spec.address not in carriers:
             known = ", ".join(carriers) or "none"
             yield f"{got}, want the name of a [{spec.kind}.<name>]; there are: {known}"
+        elif spec.kind == RAW and isinstance(table, GnssConfig | ImuConfig):
+            pass  # bytes recorded before there was a driver
         elif spec.kind not in driver.transports:
             yield f"{got}; {driver.protocol} supports: {allowed}"
         elif spec.carrier is not None:

@@ -18,6 +18,7 @@ from swath.daemon.config.tables import (
     OutputConfig,
     PpsConfig,
     ProfileConfig,
+    RawConfig,
     ScannerConfig,
     SessionConfig,
     Tables,
@@ -25,7 +26,7 @@ from swath.daemon.config.tables import (
 from swath.drivers.parser import DeviceKind, DeviceSettings
 from swath.drivers.transports.spec import TransportSpec, parse_transport
 
-DeviceTable = GnssConfig | ImuConfig | ScannerConfig | CorrectionsConfig
+DeviceTable = GnssConfig | ImuConfig | ScannerConfig | CorrectionsConfig | RawConfig
 FileKey = Literal["dbc", "calibration", "geometry"]
 PARSER_FILES: tuple[FileKey, ...] = ("dbc", "geometry")  # files that a parser needs; it does not use the calibration
 
@@ -99,6 +100,11 @@ class Config:
         return self.tables.corrections
 
     @property
+    def raw(self) -> dict[str, RawConfig]:
+        """Tables ``[raw.<name>]``, by name."""
+        return self.tables.raw
+
+    @property
     def attitude(self) -> AttitudeConfig:
         """Table ``[attitude]`` of the file."""
         return self.tables.attitude
@@ -142,6 +148,8 @@ class Config:
             yield "scanner", name, scanner
         for name, corrections in self.corrections.items():
             yield "corrections", name, corrections
+        for name, raw in self.raw.items():
+            yield "raw", name, raw
 
     def files_of(self, table: DeviceTable) -> dict[FileKey, Path]:
         """Return the files that a device's table names, by key."""
@@ -191,11 +199,12 @@ class Config:
         device does not exist.
         """
         kind, _, name = table.transport.partition(":")
-        tables: Mapping[str, DeviceTable] = self.gnss if kind == "gnss" else self.imu if kind == "imu" else {}
+        carriers: dict[str, Mapping[str, DeviceTable]] = {"gnss": self.gnss, "imu": self.imu, "raw": self.raw}
+        tables = carriers.get(kind, {})
         return (name, tables[name]) if name in tables else None
 
     def devices(self) -> Iterator[DeviceEntry]:
-        """Yield every device: GNSS, IMU, scanners, corrections, in the order of the file."""
+        """Yield every device: GNSS, IMU, scanners, corrections, raw ones, in the order of the file."""
         for kind, name, table in self.device_tables():
             auxiliary = table.auxiliary if isinstance(table, ScannerConfig) else None
             yield DeviceEntry(
@@ -204,7 +213,7 @@ class Config:
                 transport=parse_transport(table.transport),
                 auxiliary=parse_transport(auxiliary) if auxiliary else None,
                 protocol=table.protocol,
-                pps=None if isinstance(table, CorrectionsConfig) else table.pps,
+                pps=None if isinstance(table, CorrectionsConfig | RawConfig) else table.pps,
                 settings=self.settings_of(kind, name, table),
                 files=self.files_of(table),
             )

@@ -9,8 +9,8 @@ import math
 from collections.abc import Iterator, Sequence
 
 from swath.daemon.config.config import Config
-from swath.daemon.config.tables import CorrectionsConfig, GnssConfig, ImuConfig, ScannerConfig
-from swath.drivers.driver import find_driver
+from swath.daemon.config.tables import CorrectionsConfig, GnssConfig, ImuConfig, RawConfig, ScannerConfig
+from swath.drivers.driver import RAW, find_driver
 from swath.drivers.transports.spec import parse_transport
 from swath.georef.records import DeviceClockSamples, TimeMessage
 from swath.georef.text_encoding import decoded
@@ -80,8 +80,9 @@ def _unseen_pps(config: Config) -> Iterator[str]:
     """Yield a line for each device with a ``pps`` whose data cannot show that it sees the pulse."""
     for kind, name, table in config.device_tables():
         if (
-            isinstance(table, CorrectionsConfig | GnssConfig)
+            isinstance(table, CorrectionsConfig | GnssConfig | RawConfig)
             or table.pps is None
+            or table.protocol == RAW
             or table.transport.startswith("gnss:")
         ):
             continue

@@ -361,6 +361,13 @@ class CorrectionsConfig(Section):
     )
 
 
+class RawConfig(Section):
+    """``[raw.<name>]``: any device that no driver reads yet, recorded as it comes."""
+
+    transport: Text = Field(description="serial:…, udp:…, tcp:…, can:… or ntrip:…")
+    protocol: Literal["raw"] = Field("raw", description="raw")
+
+
 class AttitudeConfig(Section):
     """``[attitude]``: the vertical that the attitude refers to."""
 
@@ -480,6 +487,7 @@ class Tables(Section):
     imu: dict[Name, ImuConfig] = Field(default_factory=dict)
     scanner: dict[Name, ScannerConfig] = Field(default_factory=dict)
     corrections: dict[Name, CorrectionsConfig] = Field(default_factory=dict)
+    raw: dict[Name, RawConfig] = Field(default_factory=dict)
     attitude: AttitudeConfig = Field(default_factory=AttitudeConfig)
     atmosphere: AtmosphereConfig = Field(default_factory=AtmosphereConfig)
     mta: MtaConfig = Field(default_factory=MtaConfig)

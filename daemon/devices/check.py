@@ -26,7 +26,7 @@ from swath.daemon.devices.identify import Heard, describe_time, not_understood
 from swath.daemon.devices.values import Values
 from swath.daemon.log.directory import nearest_there
 from swath.daemon.log.host_clock import ClockDiscipline, read_clock_discipline
-from swath.drivers.driver import find_driver
+from swath.drivers.driver import RAW, find_driver
 from swath.drivers.parser import PacketParser
 from swath.drivers.session import Session
 from swath.drivers.transports.base import RawEdge, TransportCounters, UnitBlock
@@ -332,6 +332,8 @@ def bitrate_problems(spec: TransportSpec, actual: int | None) -> list[str]:
 def _answer_problems(reading: Reading) -> list[str]:
     """Return the faults of the received data."""
     entry, heard, counters = reading.entry, reading.heard, reading.parser.counters
+    if entry.protocol == RAW:
+        return []
     good = counters.messages.total()
     other = not_understood(entry, heard, good, reading.kept, refused=counters.bad_messages)
     if other is not None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from swath.daemon.config import CorrectionsConfig, DeviceEntry, DeviceTable, GnssConfig, ImuConfig, ScannerConfig
-from swath.drivers.driver import all_drivers, find_driver
+from swath.drivers.driver import RAW, all_drivers, find_driver
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.georef.records import ChunkBatch, DeviceClockSamples, ImuSamples, Record, TimeMessage, TimeTag
 
@@ -146,7 +146,7 @@ def not_understood(
         refused: number of messages that it could not decode. If they outnumber the good ones, the device counts as not
             understood: a head's second port may be readable although the head is another model, whose own port is not.
     """
-    if messages and heard.counts and refused <= messages:
+    if entry.protocol == RAW or (messages and heard.counts and refused <= messages):
         return None
     other = identify(entry, kept, than=messages)
     if other is not None:

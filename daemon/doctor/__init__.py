@@ -18,7 +18,7 @@ from swath.daemon.log.host_clock import read_clock_discipline
 from swath.daemon.log.parts import read_sign
 from swath.drivers.transports.can.bitrate import interface_bitrate
 from swath.drivers.transports.spec import TransportSpec
-from swath.drivers.transports.udp_socket import DEFAULT_BUFFER_MB
+from swath.drivers.transports.udp_port import DEFAULT_BUFFER_MB
 
 DEFAULT_DIRECTORY = Path("/var/lib/swath")
 DEFAULT_RESERVE_BYTES = 512e6

@@ -20,7 +20,7 @@ from swath.daemon.recorder.first_units import FirstUnits
 from swath.daemon.recorder.receivers import PpsReceiver, Receiver, Shared, UnitReceiver, UnitsSeen
 from swath.daemon.recorder.timekeeper import TimeKeeper
 from swath.daemon.recorder.writer import Recorder, RecorderSettings
-from swath.drivers.driver import find_driver
+from swath.drivers.driver import RAW, find_driver
 from swath.drivers.session import Session
 from swath.drivers.transports.base import UnitBlock
 from swath.drivers.transports.opening import open_pps, open_transport
@@ -103,7 +103,7 @@ def make_timekeeper(config: Config, events: Events, host_minus_monotonic_ns: int
     for name, pps in config.pps.items():
         keeper.add_pps(f"pps/{name}", leap_seconds.get(name), pps.delay_ns)
     for device in config.devices():
-        if device.kind == "gnss":
+        if device.kind == "gnss" and device.protocol != RAW:
             _add_gnss_time(keeper, device, config.gnss[device.name])
     return keeper
 
@@ -134,7 +134,7 @@ def _add_device(assembly: Assembly, device: DeviceEntry, inside: list[str]) -> N
     assembly.first_units.append(first_units)
     units_seen: list[UnitsSeen] = [first_units.add]
     for source in (device.source, *inside):
-        if source.startswith("gnss/"):
+        if source in assembly.timekeeper.receivers:
             units_seen.append(assembly.timekeeper.units_seen(source))
     if device.kind == "corrections":
         units_seen.append(_watch_corrections(assembly, device).units_seen)

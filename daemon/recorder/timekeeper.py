@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 
 from swath.daemon.log.events import Events, Severity
@@ -86,6 +86,11 @@ class TimeKeeper:
         else:
             self._clocks[source] = PpsClock(assumed_leap_seconds=assumed_leap_seconds)
         self._sources[source] = _TimeSource(source, self._clocks[source], parser, names_edge)
+
+    @property
+    def receivers(self) -> Collection[str]:
+        """Sources whose time messages are read."""
+        return self._sources.keys()
 
     def units_seen(self, source: str) -> Callable[[Int64Array, UnitBlock], None]:
         """Return the function that a GNSS receiver thread calls with the bytes it has just passed on."""

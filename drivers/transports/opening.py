@@ -24,7 +24,7 @@ def open_transport(spec: TransportSpec, stopped: Callable[[], bool] = lambda: Fa
         stopped: called while opening waits for a distant computer; True ends the wait.
 
     Raises:
-        ValueError: the kind has no transport of its own (gnss, imu).
+        ValueError: the kind has no transport of its own (gnss, imu, raw).
     """
     if spec.kind == "udp":
         return UdpTransport(spec)

@@ -6,6 +6,7 @@ tcp:<host>:<port>?silent_s=10
 can:<interface>:<channel>?<keyword>=<value>…
 gnss:<name>
 imu:<name>
+raw:<name>
 ntrip:<host>:<port>/<mountpoint>?user=<name>&password_env=<variable>&version=2&position=47.5,8.7,500
 """
 
@@ -18,8 +19,8 @@ from dataclasses import dataclass, field
 
 PPS_FORMS = "/dev/pps0, serial-dcd:/dev/ttyS0 or fixed:<path>"
 FORMS = (
-    "serial:<path>, udp:<host>:<port>, tcp:<host>:<port>, can:<interface>:<channel>, gnss:<name>, imu:<name> "
-    "or ntrip:<host>:<port>/<mountpoint>"
+    "serial:<path>, udp:<host>:<port>, tcp:<host>:<port>, can:<interface>:<channel>, gnss:<name>, imu:<name>, "
+    "raw:<name> or ntrip:<host>:<port>/<mountpoint>"
 )
 MAX_BUFFER_MB = 1023  # the kernel stores twice the value in an int
 MAX_SILENT_S = 86_400
@@ -34,8 +35,8 @@ class TransportSpec:
     """One checked transport of the configuration.
 
     Attributes:
-        kind: "serial", "udp", "tcp", "can", "ntrip", or "gnss" or "imu" (inside that device's stream: no transport of
-            its own).
+        kind: "serial", "udp", "tcp", "can", "ntrip"; or "gnss", "imu" or "raw" (inside the stream of that device: no
+            transport of its own).
         address: the text between the kind and the options.
         options: keyword to value, as text.
         text: the whole text, as configured.
@@ -84,7 +85,7 @@ class TransportSpec:
     @property
     def carrier(self) -> str | None:
         """Source whose stream holds the device's bytes, as ``gnss/rover``; None: the transport is a wire of its own."""
-        return f"{self.kind}/{self.address}" if self.kind in ("gnss", "imu") else None
+        return f"{self.kind}/{self.address}" if self.kind in ("gnss", "imu", "raw") else None
 
     @property
     def device(self) -> str:
@@ -361,6 +362,7 @@ _CHECKS: dict[str, Callable[[TransportSpec], None]] = {
     "can": _check_can,
     "gnss": _check_carrier,
     "imu": _check_carrier,
+    "raw": _check_carrier,
     "ntrip": _check_ntrip,
 }
 

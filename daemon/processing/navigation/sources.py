@@ -16,7 +16,7 @@ from swath.daemon.log.format import LogError, SessionInfo
 from swath.daemon.log.parsers import stored_config
 from swath.daemon.processing.setup.models import gimbal_sources
 from swath.daemon.processing.setup.sources import Sources
-from swath.drivers.driver import UnknownProtocolError, find_driver
+from swath.drivers.driver import RAW, UnknownProtocolError, find_driver
 from swath.drivers.parser import DriverSettingsError, Parser
 from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.navigation.inputs import ARM_UNSAID_M, GRADES, ImuNoise, Setup, imu_noise
@@ -65,9 +65,13 @@ class NavigationSources:
         self._arm_b = arm_b
         self._attachments = dict(attachments)
         gimbals = {source for name in config.scanner for _, source in gimbal_sources(config, name)}
-        of_aircraft = [name for name in config.imu if f"imu/{name}" not in gimbals]
+        of_aircraft = [
+            name for name, table in config.imu.items() if f"imu/{name}" not in gimbals and table.protocol != RAW
+        ]
         self.imu_name = _chosen("imu", imu, list(config.imu), of_aircraft)
-        receivers = [name for name in config.gnss if f"gnss/{name}" not in gimbals]
+        receivers = [
+            name for name, table in config.gnss.items() if f"gnss/{name}" not in gimbals and table.protocol != RAW
+        ]
         self.gnss_name: str | None = None
         if receivers or gnss is not None or not outside:
             self.gnss_name = _chosen("gnss", gnss, list(config.gnss), receivers)
@@ -136,7 +140,7 @@ class NavigationSources:
         """
         made: dict[str, Parser] = {}
         for kind, name, table in self.config.device_tables():
-            if kind in ("scanner", "corrections") or (kind == "imu" and name != self.imu_name):
+            if kind in ("scanner", "corrections", "raw") or (kind == "imu" and name != self.imu_name):
                 continue
             source = f"{kind}/{name}"
             try:

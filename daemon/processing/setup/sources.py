@@ -14,7 +14,7 @@ from swath.daemon.config.tables import GnssConfig, ImuConfig
 from swath.daemon.errors import ConfigError
 from swath.daemon.log.format import SessionInfo
 from swath.daemon.processing.setup.models import gimbal_sources
-from swath.drivers.driver import Driver, UnknownProtocolError, find_driver
+from swath.drivers.driver import RAW, Driver, UnknownProtocolError, find_driver
 from swath.drivers.parser import DeviceKind, DriverSettingsError, Parser
 from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.geodesy.rotations import attitude_of, rot_l_from_b
@@ -71,7 +71,14 @@ class Sources:
     @property
     def imu_source(self) -> str | None:
         """The first IMU of the aircraft."""
-        return next((source for name in self.config.imu if (source := f"imu/{name}") not in self.gimbal_sources), None)
+        return next(
+            (
+                source
+                for name, imu in self.config.imu.items()
+                if (source := f"imu/{name}") not in self.gimbal_sources and imu.protocol != RAW
+            ),
+            None,
+        )
 
     @property
     def clock_of_imu(self) -> str | None:
@@ -179,6 +186,7 @@ class Sources:
                     gnss.leap_seconds,
                 )
                 for name, gnss in config.gnss.items()
+                if gnss.protocol != RAW
             }
             | heads,
             devices=devices,
@@ -188,7 +196,10 @@ class Sources:
         """Return the clock of a device: its pulse's; for a device without one, the first that the host has."""
         if pps is not None:
             return f"pps/{pps}"
-        shown = [*(f"pps/{name}" for name in self.config.pps), *(f"gnss/{name}" for name in self.config.gnss)]
+        shown = [
+            *(f"pps/{name}" for name in self.config.pps),
+            *(f"gnss/{name}" for name, gnss in self.config.gnss.items() if gnss.protocol != RAW),
+        ]
         return shown[0] if shown else None
 
     def ins_rows(self, rows: StructArray) -> StructArray:

@@ -190,7 +190,7 @@ class TestDevices:
     def test_json_lists_every_driver_with_its_requirements(self) -> None:
         run = swath("devices", "--json")
         listed = {(row["kind"], row["protocol"]): row for row in json.loads(run.stdout)["devices"]}
-        assert set(listed) == {(kind, protocol) for kind in KINDS for protocol in all_drivers(kind)}
+        assert set(listed) == {("raw", "raw"), *((kind, protocol) for kind in KINDS for protocol in all_drivers(kind))}
         srep = listed["scanner", "srep"]
         assert srep["transports"] == ["udp"]
         assert srep["needs"] == ["mirror_factor"]
@@ -204,7 +204,7 @@ class TestDevices:
                 assert all(record.__name__ in text for record in driver.yields)
 
 
-SOURCES = ["pps/main", "gnss/rover", "imu/main", "scanner/left", "corrections/base"]
+SOURCES = ["pps/main", "gnss/rover", "imu/main", "scanner/left", "corrections/base", "raw/radar"]
 
 
 class TestCheckOffline:
@@ -212,7 +212,7 @@ class TestCheckOffline:
         run = swath("check", "--offline", str(AIRCRAFT))
         assert run.returncode == 0
         first, second, *_ = run.stdout.splitlines()
-        assert first == f"{AIRCRAFT}: valid; 5 sources: pps/main, gnss/rover, imu/main, scanner/left, corrections/base"
+        assert first == f"{AIRCRAFT}: valid; 6 sources: pps/main, gnss/rover, imu/main, scanner/left, corrections/base"
         assert second == "imu/main: its x forward, y right, z down"
 
     def test_json_lists_the_sources(self) -> None:

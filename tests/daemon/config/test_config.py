@@ -22,7 +22,7 @@ from swath.daemon.config.rotations import matrix_of_deg, rotation_problem
 from swath.daemon.errors import ConfigError, ExitCode, UserError
 from swath.daemon.log.parsers import stored_parsers
 from swath.daemon.processing.setup.models import mount_of
-from swath.drivers.driver import all_drivers
+from swath.drivers.driver import RAW, all_drivers
 from swath.drivers.transports.spec import parse_transport
 
 ROOT = Path(__file__).parents[3]
@@ -35,8 +35,8 @@ def expected_lines(path: Path) -> list[str]:
     """Return the lines that a bad file expects, from its comments."""
     words = {
         "here": str(path.parent),
-        "gnss": ", ".join(sorted(all_drivers("gnss"))),
-        "scanner": ", ".join(sorted(all_drivers("scanner"))),
+        "gnss": ", ".join(sorted([*all_drivers("gnss"), RAW])),
+        "scanner": ", ".join(sorted([*all_drivers("scanner"), RAW])),
         "nmea": ", ".join(all_drivers("gnss")["nmea"].transports),
     }
     lines = re.findall(r"^# expect: (.*)$", path.read_text(), flags=re.MULTILINE)
@@ -321,7 +321,7 @@ class TestDevices:
 
     def test_devices_have_all_settings_of_a_recorder(self, config: Config) -> None:
         devices = {device.source: device for device in config.devices()}
-        assert list(devices) == ["gnss/rover", "imu/main", "scanner/left", "corrections/base"]
+        assert list(devices) == ["gnss/rover", "imu/main", "scanner/left", "corrections/base", "raw/radar"]
         imu, scanner = devices["imu/main"], devices["scanner/left"]
         assert (imu.transport.kind, imu.transport.address) == ("can", "socketcan:can0")
         assert imu.files == {"dbc": FIXTURES / "imu.dbc"}
@@ -405,7 +405,7 @@ def _findings(table: dict[str, Any]) -> list[str]:
         config = validate(table, AIRCRAFT, "")
     except ConfigError as error:
         return error.lines or ["an error without a line"]
-    count = len(config.gnss) + len(config.imu) + len(config.scanner) + len(config.corrections)
+    count = len(config.gnss) + len(config.imu) + len(config.scanner) + len(config.corrections) + len(config.raw)
     assert len(list(config.devices())) == count
     return []
 
