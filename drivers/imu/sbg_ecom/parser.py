@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from swath.drivers.driver import STREAM_TRANSPORTS, Driver
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import NMEA
 from swath.drivers.gnss.date_floor import GPS_EPOCH, leap_seconds_of
@@ -446,15 +446,14 @@ def make_time_parser(settings: DeviceSettings) -> SbgEcomParser:
     return SbgEcomParser(settings, wanted=(TimeMessage,))
 
 
-DRIVERS = (
-    Driver(
-        protocol="sbg-ecom",
-        kind="imu",
-        transports=STREAM_TRANSPORTS,
-        yields=(ImuSamples, InsSolution, TimeMessage, GnssFix, GnssHeading, EventMark, DeviceStatus),
-        summary="SBG Systems by sbgECom: IMU, EKF, receivers, UTC, events",
-        make_parser=SbgEcomParser,
-        make_time_parser=make_time_parser,
-        names_edge=NamesEdge.PREVIOUS,
-    ),
+UNIT = Driver(
+    protocol="sbg-ecom",
+    kind="imu",
+    transports=STREAM_TRANSPORTS,
+    yields=(ImuSamples, InsSolution, TimeMessage, GnssFix, GnssHeading, EventMark, DeviceStatus),
+    summary="SBG Systems by sbgECom: IMU, EKF, receivers, UTC, events",
+    make_parser=SbgEcomParser,
+    make_time_parser=make_time_parser,
+    names_edge=NamesEdge.PREVIOUS,
 )
+DRIVERS = (UNIT, receiver_inside(UNIT))

@@ -212,7 +212,10 @@ class TestCheckOffline:
         run = swath("check", "--offline", str(AIRCRAFT))
         assert run.returncode == 0
         first, second, *_ = run.stdout.splitlines()
-        assert first == f"{AIRCRAFT}: valid; 6 sources: pps/main, gnss/rover, imu/main, scanner/left, corrections/base"
+        assert (
+            first
+            == f"{AIRCRAFT}: valid; 6 sources: pps/main, gnss/rover, imu/main, scanner/left, {', '.join(SOURCES[4:])}"
+        )
         assert second == "imu/main: its x forward, y right, z down"
 
     def test_json_lists_the_sources(self) -> None:
@@ -223,4 +226,5 @@ class TestCheckOffline:
             "imu/main",
             "scanner/left",
             "corrections/base",
+            "raw/radar",
         ]
