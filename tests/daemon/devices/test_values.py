@@ -34,8 +34,8 @@ from tests.daemon.wires import pty, repeating
 ROOT = Path(__file__).parents[3]
 GROUP = "239.74.163.2"
 NOW = TimeTag(TimeScale.GPS, 0, week=2443)
-UP_IS_X = [[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # the IMU's x axis points up
-IDENTITY = [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]
+UP_IS_X: list[list[float]] = [[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]  # the IMU's x axis points up
+IDENTITY: list[list[float]] = [[1.0, 0, 0], [0, 1, 0], [0, 0, 1]]
 
 
 def imu(
