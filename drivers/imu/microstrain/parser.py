@@ -56,7 +56,7 @@ FIX_FLAGS_VALID = 0x04
 CORRECTED = 0x03  # SBAS or differential corrections used
 LEAP_SECONDS_VALID = 0x02
 FIX_TYPES = {0: FixType.SINGLE, 1: FixType.SINGLE, 5: FixType.RTK_FLOAT, 6: FixType.RTK_FIXED, 7: FixType.DIFFERENTIAL}
-ANTENNAS = {"gnss": "primary", "gnss1": "primary", "gnss2": "secondary"}
+ANTENNAS = {"gnss": "primary", "gnss1": "primary", "gnss2": "secondary"}  # others have no lever arm in Swath
 STATUS_SHIFT = 16  # status of a solution: the filter's state in the low bits, its flags above
 
 
@@ -129,7 +129,7 @@ class MicrostrainParser(StreamParser):
             items += self._sample(host_time_ns, values, moment)
         elif descriptor_set == FILTER:
             items += self._solution(host_time_ns, values, moment)
-        elif descriptor_set in RECEIVERS:
+        elif RECEIVERS.get(descriptor_set) in ANTENNAS:
             items += self._fix(host_time_ns, descriptor_set, values, moment)
         return items + self._status(host_time_ns, descriptor_set, values)
 
@@ -294,7 +294,7 @@ def gnss_fix(host_time_ns: int, receiver: str, moment: Moment, values: Values) -
         velocity_cov_l=np.eye(3) * speed_sigma**2 if moving and velocity_known & SPEED_ACCURACY else None,
         fix_type=fix_type if there else FixType.NONE,
         satellites=satellites,
-        antenna=ANTENNAS.get(receiver, receiver),
+        antenna=ANTENNAS[receiver],
         valid=there and moment.valid,
         message=receiver,
         undulation_m=undulation,

@@ -28,7 +28,7 @@ from swath.drivers.gnss.record_rows import Row, join_rows
 from swath.drivers.imu.attitude import angles_of
 from swath.drivers.imu.unit_time import WEEK_NS, Moment, UnitTime
 from swath.drivers.imu.vectornav.startup import startup_messages
-from swath.drivers.imu.vectornav.wire import RECEIVERS, VECTORNAV, read_values
+from swath.drivers.imu.vectornav.wire import VECTORNAV, read_values
 from swath.drivers.parser import DeviceSettings, StreamParser
 from swath.georef.records import (
     Chunk,
@@ -65,7 +65,7 @@ FIX_TYPES = {
     7: FixType.RTK_FLOAT,
     8: FixType.RTK_FIXED,
 }
-ANTENNAS = {"gnss1": "primary", "gnss2": "secondary", "gnss3": "gnss3"}
+ANTENNAS = {"gnss1": "primary", "gnss2": "secondary"}  # a third receiver has no lever arm in Swath
 MEASURED = (("uncomp_accel", "uncomp_gyro"), ("accel", "angular_rate"))
 
 
@@ -136,7 +136,7 @@ class VectornavParser(StreamParser):
         items: Items = [*self._time.name_second(host_time_ns, moment, self._latest.leap_seconds)]
         if self._wanted == (TimeMessage,):
             return items
-        for receiver in RECEIVERS.values():
+        for receiver in ANTENNAS:
             items += self._fix(host_time_ns, receiver, values)
         return [
             *items,

@@ -87,6 +87,7 @@ class TestWholeFile:
             "imu.*.extended_ids",
             "imu.*.byte_order",
             "imu.*.pps_event",
+            "imu.*.altitude",
             "scanner.*.geometry.facets",
             "scanner.*.geometry.nutation_deg",
             "scanner.*.geometry.shaft_angle_deg",

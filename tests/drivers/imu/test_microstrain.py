@@ -223,8 +223,9 @@ def test_positions_of_receivers() -> None:
     records, _ = parse(
         *(fix_packet(), fix_packet()),
         fix_packet(0x92, fix=(6, 20, 0, 7)),
-        fix_packet(0x93, fix=(0, 9, 1, 7), position=(47.5, 8.75, 550.0, 502.0, 1.0, 2.0, 0x09)),
-        fix_packet(0x91, fix=(3, 2, 0, 7)),
+        fix_packet(0x91, fix=(0, 9, 1, 7), position=(47.5, 8.75, 550.0, 502.0, 1.0, 2.0, 0x09)),
+        fix_packet(0x91, fix=(3, 2, 0, 7), epoch=(303_000.2, WEEK, 3)),
+        fix_packet(0x93),  # a third receiver, for which there is no lever arm
     )
     first, second, third, none = of(records, GnssFix)
     assert (first.fix_type, first.satellites, first.antenna, first.valid) == (FixType.SINGLE, 12, "primary", True)
@@ -234,7 +235,7 @@ def test_positions_of_receivers() -> None:
     np.testing.assert_allclose(np.diag(first.velocity_cov_l), [0.01] * 3, rtol=1e-6)
     assert (second.antenna, second.fix_type) == ("secondary", FixType.RTK_FIXED)
     assert (third.antenna, third.fix_type, third.height_m, third.undulation_m) == (
-        "gnss3",
+        "primary",
         FixType.DIFFERENTIAL,
         None,
         None,
