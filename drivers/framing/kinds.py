@@ -248,6 +248,60 @@ def unicore_name(frame: bytes) -> str:
     return f"UNICORE-{UNICORE_LENGTHS.unpack_from(frame)[0]}"
 
 
+# --- Trimble DCOL GENOUT: 02, status, 40, length, data, sum, 03 (Trimble OEM receiver help, GSOF messages) ------------
+
+GENOUT_OVERHEAD_BYTES = 6
+GENOUT_END = 0x03
+
+
+def measure_genout(buffer: bytes, start: int, final: bool) -> int:
+    """Measure a packet by its length byte; it must end in 03."""
+    if len(buffer) - start < 4:
+        return UNDECIDED
+    length = buffer[start + 3] + GENOUT_OVERHEAD_BYTES
+    end = start + length
+    return FALSE_SYNC if end <= len(buffer) and buffer[end - 1] != GENOUT_END else length
+
+
+def intact_genout(frame: bytes) -> bool:
+    """Return whether the sum of status to data, modulo 256, is the byte behind the data."""
+    return sum(frame[1:-2]) & 0xFF == frame[-2]
+
+
+# --- Applanix POS: $GRP or $MSG, id, length, data with padding, sum, $# (POS AV and LV user interface documents) ------
+
+POS_HEADER_BYTES = 8
+POS_LENGTHS = struct.Struct("<4xHH")  # id, length behind this field
+POS_MAX_BYTES = 16 * 1024
+POS_TAIL = b"$#"
+
+
+def measure_pos(buffer: bytes, start: int, final: bool) -> int:
+    """Measure a group or message by its length field, a multiple of 4; it must end in ``$#``."""
+    if len(buffer) - start < POS_HEADER_BYTES:
+        return UNDECIDED
+    if buffer[start + 1 : start + 4] not in (b"GRP", b"MSG"):
+        return FALSE_SYNC
+    length = POS_HEADER_BYTES + POS_LENGTHS.unpack_from(buffer, start)[1]
+    if length % 4 or length < POS_HEADER_BYTES + 4:
+        return FALSE_SYNC
+    if length > POS_MAX_BYTES:
+        return OVER_BOUND
+    end = start + length
+    return FALSE_SYNC if end <= len(buffer) and buffer[end - 2 : end] != POS_TAIL else length
+
+
+def intact_pos(frame: bytes) -> bool:
+    """Return whether all 16-bit words, checksum included, add up to 0 modulo 65536."""
+    total: int = sum(struct.unpack(f"<{len(frame) // 2}H", frame))
+    return total & 0xFFFF == 0
+
+
+def pos_name(frame: bytes) -> str:
+    """Return a name such as ``GRP1`` or ``MSG50``."""
+    return f"{frame[1:4].decode()}{POS_LENGTHS.unpack_from(frame)[0]}"
+
+
 # --- Xbus: FA FF, message identifier, length, data, checksum (Xsens MT Low-Level Communication Protocol) --------------
 
 XBUS_MAX_DATA_BYTES = 2048  # data of a message with an extended length
@@ -310,6 +364,8 @@ def sbf_name(frame: bytes) -> str:
     return f"SBF-{SBF_HEADER.unpack_from(frame)[1] & SBF_NUMBER_BITS}"
 
 
+# before NMEA, whose sentences begin alike: the first kind of a list that matches counts
+POS = FrameKind("pos", (b"$", b"GM", b"RS", b"PG"), POS_MAX_BYTES, measure_pos, intact_pos, pos_name)
 NMEA = FrameKind("nmea", (b"$!", bytes(range(0x41, 0x5B))), NMEA_MAX_BYTES, measure_nmea, intact_nmea, nmea_name)
 UBX = FrameKind(
     "ubx",
@@ -345,6 +401,14 @@ NOVATEL_SHORT = FrameKind(
     novatel_name,
 )
 
+GENOUT = FrameKind(
+    "genout",
+    (b"\x02", bytes(range(256)), b"\x40"),
+    255 + GENOUT_OVERHEAD_BYTES,
+    measure_genout,
+    intact_genout,
+    lambda frame: "GENOUT",
+)
 UNICORE = FrameKind(
     "unicore",
     (b"\xaa", b"D", b"\xb5"),

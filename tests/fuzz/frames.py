@@ -69,6 +69,20 @@ def _seal_novatel_short(frame: bytes) -> bytes:
     return bytes(content) + struct.pack("<I", crc32_novatel(content))
 
 
+def _seal_genout(frame: bytes) -> bytes:
+    content = frame[1:2].ljust(1, b"\0") + b"\x40" + bytes([len(frame[4:-2][:255])]) + frame[4:-2][:255]
+    return b"\x02" + content + bytes([sum(content) & 0xFF]) + b"\x03"
+
+
+def _seal_pos(frame: bytes) -> bytes:
+    begin = frame[:4] if frame[:4] in (b"$GRP", b"$MSG") else b"$GRP"
+    data = frame[8:-4][: 16 * 1024 - 12]
+    data += bytes(-len(data) % 4)
+    content = begin + frame[4:6].ljust(2, b"\1") + struct.pack("<H", len(data) + 4) + data
+    total = sum(struct.unpack(f"<{len(content) // 2}H", content)) + int.from_bytes(b"$#", "little")
+    return content + struct.pack("<H", -total & 0xFFFF) + b"$#"
+
+
 def _seal_unicore(frame: bytes) -> bytes:
     content = bytearray(b"\xaaD\xb5" + frame[3:-4].ljust(21, b"\0")[: 21 + 16 * 1024])
     struct.pack_into("<H", content, 6, len(content) - 24)
@@ -137,6 +151,8 @@ SEALS: dict[str, Callable[[bytes], bytes]] = {
     "novatel-short": _seal_novatel_short,
     "novatel-ascii": _seal_novatel_ascii,
     "unicore": _seal_unicore,
+    "genout": _seal_genout,
+    "pos": _seal_pos,
     "xbus": _seal_xbus,
     "sbf": _seal_sbf,
     "vectornav": _seal_vectornav,

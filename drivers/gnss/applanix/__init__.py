@@ -1,0 +1,1 @@
+"""Trimble and Applanix: GSOF reports and POS groups."""

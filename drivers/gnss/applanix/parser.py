@@ -1,0 +1,458 @@
+"""Trimble GSOF (protocol ``gsof``) and Applanix POS groups (protocol ``applanix-pos``), each with its INS.
+
+Frames: the vehicle's axes are forward, right, down, and roll, pitch and heading lead to them from north, east, down in
+the order heading, pitch, roll; right wing down, nose up and clockwise are positive, as here. Group 1's heading is true:
+its wander angle is that of the INS's own frame and is not part of it, nor of its velocities, which are north, east,
+down (POS LV user ICD, group 1; its track angle is that of these velocities).
+
+GSOF: records of one report make one `GnssFix` (1, 2, 8, 12, 70). Record 1 on the whole second and 16 name the previous
+edge. 49 makes a row of `InsSolution`, with the sigmas of a 50 of the same time or else of the last 50 of a second.
+
+POS: group 1 makes a row, with the sigmas of the last group 2 of a second. Its week comes from group 3. Group 7 is sent
+for each pulse and names it; groups 5 and 6 are events, 10 the status. Group 4 has counts of the IMU whose scale the
+document does not give, groups 102 and 103 the navigation of other points of the vehicle: both are counted only.
+
+Rows without alignment (GSOF below "aligned", POS beyond "fine alignment") are counted as ``ins_not_aligned``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import cos, isfinite, nan, radians, sin
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver
+from swath.drivers.framing.framer import Frame, Framer
+from swath.drivers.framing.kinds import GENOUT, NMEA, POS, pos_name
+from swath.drivers.gnss.applanix import groups as pos
+from swath.drivers.gnss.applanix import gsof
+from swath.drivers.gnss.date_floor import WEEK_MS, ReceiverDates
+from swath.drivers.gnss.record_rows import Row, join_rows
+from swath.drivers.parser import DeviceSettings, StreamParser
+from swath.georef.records import (
+    Chunk,
+    DeviceStatus,
+    EventMark,
+    FixType,
+    GnssFix,
+    InsSolution,
+    NamesEdge,
+    Record,
+    TimeMessage,
+    TimeScale,
+    TimeTag,
+)
+from swath.georef.timescales.gps_time import MILLISECOND_NS, SECOND_NS
+
+Items: TypeAlias = list[Record | Row]
+Triple: TypeAlias = tuple[float, float, float]
+
+WEEK_NS = WEEK_MS * MILLISECOND_NS
+WEEK_S = WEEK_MS // 1000
+SIGMAS_LAST_NS = 1_500_000_000  # sigmas are sent once a second or with every epoch
+UNKNOWN: Triple = (nan, nan, nan)
+
+
+@dataclass(frozen=True, slots=True)
+class Sigmas:
+    """Sigmas of position, velocity and attitude (m, m/s, rad) at a time of week."""
+
+    time_ns: int
+    position_l: Triple
+    velocity_l: Triple
+    attitude_rad: Triple
+
+
+def sigmas_of(time_ns: int, values: tuple[float, ...]) -> Sigmas:
+    """Return sigmas of nine RMS errors: north, east, down, twice, and roll, pitch, heading in degrees."""
+    return Sigmas(
+        time_ns,
+        (values[0], values[1], values[2]),
+        (values[3], values[4], values[5]),
+        (radians(values[6]), radians(values[7]), radians(values[8])),
+    )
+
+
+def navigation_row(
+    host_time_ns: int,
+    week: int,
+    time_ns: int,
+    navigation: gsof.InsNavigation | pos.Navigation,
+    sigmas: Sigmas | None,
+) -> Row:
+    """Return a row of `INS_DTYPE`; its status is the alignment status."""
+    apart = None if sigmas is None else (time_ns - sigmas.time_ns + WEEK_NS // 2) % WEEK_NS - WEEK_NS // 2
+    known = sigmas if apart is not None and abs(apart) <= SIGMAS_LAST_NS else None
+    values = (
+        host_time_ns,
+        week * WEEK_NS + time_ns,
+        radians(navigation.lat_deg),
+        radians(navigation.lon_deg),
+        navigation.height_m,
+        (navigation.north_mps, navigation.east_mps, navigation.down_mps),
+        radians(navigation.roll_deg),
+        radians(navigation.pitch_deg),
+        radians(navigation.heading_deg),
+        known.position_l if known else UNKNOWN,
+        known.velocity_l if known else UNKNOWN,
+        known.attitude_rad if known else UNKNOWN,
+        navigation.alignment,
+    )
+    return Row(InsSolution, values)
+
+
+class _Parser(StreamParser):
+    """Holds what both protocols share: framing, weeks, and the filter of record types."""
+
+    def __init__(self, settings: DeviceSettings, wanted: tuple[type, ...] | None, kinds: tuple[Any, ...]) -> None:
+        super().__init__()
+        self._framer = Framer(kinds, self.counters)
+        self._dates = ReceiverDates(settings)
+        self._wanted = wanted
+        self._sigmas: Sigmas | None = None
+
+    def feed(self, chunk: Chunk) -> list[Record]:
+        """Take one read; return the records that it completed."""
+        return self._decode_all(self._framer.feed(chunk.data, chunk.host_time_ns))
+
+    def close(self) -> list[Record]:
+        """Return the records of the tail."""
+        return self._decode_all(self._framer.close())
+
+    def remarks(self) -> list[str]:
+        """Return remarks on the receiver's weeks."""
+        return self._dates.remarks()
+
+    def _decode_all(self, frames: list[Frame]) -> list[Record]:
+        items: Items = [item for frame in frames for item in self._decode(frame)]
+        if self._wanted is not None:
+            items = [item for item in items if (item.record if isinstance(item, Row) else type(item)) in self._wanted]
+        return join_rows(items)
+
+    def _decode(self, frame: Frame) -> Items:
+        raise NotImplementedError
+
+    def _bad(self, code: str) -> Items:
+        self.counters.bad_messages += 1
+        self.counters.errors[code] += 1
+        return []
+
+    def _week(self, week: int, host_time_ns: int) -> int | None:
+        """Return a week after the move by roll-overs; None, counted, before the floor."""
+        week = self._dates.week(week, host_time_ns)
+        if week < self._dates.floor_week:
+            self.counters.errors["date_before_floor"] += 1
+            return None
+        return week
+
+
+# --- GSOF ---
+
+
+class GsofParser(_Parser):
+    """Decodes GSOF reports.
+
+    Args:
+        settings: ``date_floor`` is the oldest accepted date, ``add_weeks`` is added to all weeks.
+        wanted: the record types to return; None: all.
+    """
+
+    def __init__(self, settings: DeviceSettings, *, wanted: tuple[type, ...] | None = None) -> None:
+        super().__init__(settings, wanted, (GENOUT, NMEA))
+        self._pages = gsof.Pages(self.counters)
+
+    def _decode(self, frame: Frame) -> Items:
+        report = self._pages.add(frame.data) if frame.kind == GENOUT.name else None
+        if report is None:
+            return []
+        records: dict[int, bytes] = {}
+        for number, data in gsof.split_records(report, self.counters):
+            self.counters.messages[f"GSOF{number}"] += 1
+            records.setdefault(number, data)
+        return self._report(frame.host_time_ns, records)
+
+    def _report(self, host_time_ns: int, records: dict[int, bytes]) -> Items:
+        found: dict[int, Any] = {}
+        for layout in LAYOUTS:
+            if layout.number not in records:
+                continue
+            message = layout.decode(records[layout.number])
+            if message is None or getattr(message, "milliseconds", 0) >= WEEK_MS:
+                self._bad("bad_length" if message is None else "bad_time")
+                continue
+            if not all(map(isfinite, message)):
+                self._bad("not_finite")
+                continue
+            found[layout.number] = message
+        items: Items = []
+        for number, decode in self._decoders().items():
+            if number in found:
+                items += decode(host_time_ns, found)
+        return items
+
+    def _decoders(self) -> dict[int, Callable[[int, dict[int, Any]], Items]]:
+        return {
+            1: self._fix,
+            16: self._current_time,
+            38: self._quality,
+            41: self._base,
+            50: self._rms,
+            49: self._navigation,
+        }
+
+    def _fix(self, host_time_ns: int, found: dict[int, Any]) -> Items:
+        """Return the second and the fix of a report; without a record 2 the fix has a velocity only, or is none."""
+        time: gsof.PositionTime = found[1]
+        week = self._week(time.week, host_time_ns)
+        tag = TimeTag(TimeScale.GPS, time.milliseconds * MILLISECOND_NS, week=week)
+        items: Items = []
+        if time.milliseconds % 1000 == 0 and week is not None:
+            valid = time.flags1 & gsof.CLOCK_COMPUTED != 0
+            items.append(TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message="GSOF1"))
+        place: gsof.LatLonHeight | None = found.get(2)
+        velocity = _velocity(found.get(8))
+        if place is None and velocity is None:
+            return items
+        computed = time.flags1 & gsof.HORIZONTAL_COMPUTED != 0
+        there = place if computed else None
+        height_m = there.height_m if there is not None and time.flags1 & gsof.HEIGHT_COMPUTED else None
+        geoid: gsof.LatLonGeoid | None = found.get(70)
+        fix = GnssFix(
+            host_time_ns,
+            tag,
+            there.lat_rad if there is not None else None,
+            there.lon_rad if there is not None else None,
+            height_m,
+            velocity_l=velocity,
+            position_cov_l=_covariance(found.get(12)) if there is not None else None,
+            fix_type=_fix_type(time),
+            satellites=time.satellites,
+            valid=computed and week is not None,
+            message="GSOF1",
+            undulation_m=height_m - geoid.height_msl_m if height_m is not None and geoid is not None else None,
+        )
+        return [*items, fix]
+
+    def _current_time(self, host_time_ns: int, found: dict[int, Any]) -> Items:
+        """Return the time of a report, and leap seconds where they are valid."""
+        time: gsof.CurrentTime = found[16]
+        week = self._week(time.week, host_time_ns)
+        leap = time.leap_seconds if time.flags & 2 else None
+        tag = TimeTag(TimeScale.GPS, time.milliseconds * MILLISECOND_NS, week=week, leap_seconds=leap)
+        valid = week is not None and time.flags & 1 != 0
+        return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, valid=valid, message="GSOF16")]
+
+    def _quality(self, host_time_ns: int, found: dict[int, Any]) -> Items:
+        return [DeviceStatus(host_time_ns, dict(found[38]._asdict()), message="GSOF38")]
+
+    def _base(self, host_time_ns: int, found: dict[int, Any]) -> Items:
+        return [DeviceStatus(host_time_ns, dict(found[41]._asdict()), message="GSOF41")]
+
+    def _rms(self, host_time_ns: int, found: dict[int, Any]) -> Items:
+        rms: gsof.InsRms = found[50]
+        self._sigmas = sigmas_of(rms.milliseconds * MILLISECOND_NS, rms[4:])
+        return []
+
+    def _navigation(self, host_time_ns: int, found: dict[int, Any]) -> Items:
+        navigation: gsof.InsNavigation = found[49]
+        if navigation.alignment not in (gsof.ALIGNED, gsof.FULL_NAVIGATION):
+            self.counters.errors["ins_not_aligned"] += 1
+            return []
+        week = self._week(navigation.week, host_time_ns)
+        if week is None:
+            return []
+        time_ns = navigation.milliseconds * MILLISECOND_NS
+        return [navigation_row(host_time_ns, week, time_ns, navigation, self._sigmas)]
+
+
+LAYOUTS: tuple[gsof.Layout[Any], ...] = (
+    *(gsof.POSITION_TIME, gsof.LAT_LON_HEIGHT, gsof.VELOCITY, gsof.POSITION_SIGMA, gsof.CURRENT_TIME),
+    *(gsof.POSITION_TYPE, gsof.BASE_POSITION, gsof.INS_NAVIGATION, gsof.INS_RMS, gsof.LAT_LON_GEOID),
+)
+
+
+def _fix_type(time: gsof.PositionTime) -> FixType:
+    if not time.flags1 & gsof.HORIZONTAL_COMPUTED:
+        return FixType.NONE
+    if not time.flags2 & gsof.DIFFERENTIAL:
+        return FixType.SINGLE
+    if not time.flags2 & gsof.CARRIER:
+        return FixType.DIFFERENTIAL
+    return FixType.RTK_FIXED if time.flags2 & gsof.FIXED else FixType.RTK_FLOAT
+
+
+def _velocity(velocity: gsof.Velocity | None) -> Triple | None:
+    if velocity is None or not velocity.flags & gsof.VELOCITY_VALID:
+        return None
+    speed, course = velocity.horizontal_mps, velocity.course_rad
+    return speed * cos(course), speed * sin(course), -velocity.up_mps
+
+
+def _covariance(sigma: gsof.PositionSigma | None) -> np.ndarray[Any, np.dtype[np.float64]] | None:
+    """Return the covariance of north, east, down."""
+    if sigma is None:
+        return None
+    ne = sigma.east_north_m2
+    return np.array(
+        [
+            [sigma.north_sigma_m**2, ne, 0.0],
+            [ne, sigma.east_sigma_m**2, 0.0],
+            [0.0, 0.0, sigma.up_sigma_m**2],
+        ]
+    )
+
+
+# --- POS groups ---
+
+
+class PosParser(_Parser):
+    """Decodes POS groups; messages (``$MSG``) and all other groups are framed and counted.
+
+    Args:
+        settings: ``date_floor`` is the oldest accepted date, ``add_weeks`` is added to all weeks.
+        wanted: the record types to return; None: all.
+    """
+
+    def __init__(self, settings: DeviceSettings, *, wanted: tuple[type, ...] | None = None) -> None:
+        super().__init__(settings, wanted, (POS, NMEA))
+        self._status: tuple[int, int, int] | None = None  # week, time of week (ns) and leap seconds of the last group 3
+
+    def _decode(self, frame: Frame) -> Items:
+        if frame.kind != POS.name:
+            return []
+        decoders: dict[str, Callable[[int, bytes], Items]] = {
+            "GRP1": self._navigation,
+            "GRP2": self._performance,
+            "GRP3": self._gnss_status,
+            "GRP4": self._imu,
+            "GRP5": self._event,
+            "GRP6": self._event,
+            "GRP7": self._pps,
+            "GRP10": self._general,
+        }
+        decode = decoders.get(pos_name(frame.data))
+        return [] if decode is None else decode(frame.host_time_ns, frame.data)
+
+    def _tag(self, times: pos.TimeDistance) -> TimeTag | None:
+        """Return GPS time of a group: of its first or second time, whichever is GPS or UTC time; None, counted, else.
+
+        The week is that of the last group 3, carried over the week's end. UTC becomes GPS time by its leap seconds.
+        """
+        kinds = ((times.time1_s, times.time_types & 0xF), (times.time2_s, times.time_types >> 4))
+        for kind in (pos.TIME_GPS, pos.TIME_UTC):
+            seconds = next((seconds for seconds, found in kinds if found == kind), None)
+            if seconds is None or not -1.0 < seconds < WEEK_S + 1.0:
+                continue
+            if kind == pos.TIME_UTC and self._status is None:
+                continue
+            leap = self._status[2] if kind == pos.TIME_UTC and self._status is not None else 0
+            time_ns = round(seconds * SECOND_NS) + leap * SECOND_NS
+            if self._status is None:
+                return TimeTag(TimeScale.GPS, time_ns % WEEK_NS)
+            week, status_ns, _ = self._status
+            week += time_ns // WEEK_NS + round((status_ns - time_ns % WEEK_NS) / WEEK_NS)
+            return TimeTag(TimeScale.GPS, time_ns % WEEK_NS, week=week)
+        self.counters.errors["time_unknown"] += 1
+        return None
+
+    def _navigation(self, host_time_ns: int, data: bytes) -> Items:
+        found = pos.NAVIGATION.decode(data)
+        if found is None or not all(map(isfinite, (*found[0], *found[1]))):
+            return self._bad("bad_length" if found is None else "not_finite")
+        times, navigation = found
+        if navigation.alignment not in (pos.FULL_NAVIGATION, pos.FINE_ALIGNMENT):
+            self.counters.errors["ins_not_aligned"] += 1
+            return []
+        tag = self._tag(times)
+        if tag is None:
+            return []
+        if tag.week is None:
+            self.counters.errors["time_unknown"] += 1
+            return []
+        return [navigation_row(host_time_ns, tag.week, tag.time_ns, navigation, self._sigmas)]
+
+    def _performance(self, host_time_ns: int, data: bytes) -> Items:
+        found = pos.PERFORMANCE.decode(data)
+        if found is None or not all(map(isfinite, (*found[0], *found[1]))):
+            return self._bad("bad_length" if found is None else "not_finite")
+        tag = self._tag(found[0])
+        if tag is not None:
+            self._sigmas = sigmas_of(tag.time_ns, found[1])
+        return []
+
+    def _gnss_status(self, host_time_ns: int, data: bytes) -> Items:
+        """Note week and leap seconds; return the status."""
+        found = pos.decode_gnss_status(data)
+        if found is None or not all(map(isfinite, (*found[0], *found[2]))):
+            return self._bad("bad_length" if found is None else "not_finite")
+        times, solution, status = found
+        week = self._week(status.week, host_time_ns) if 0 < status.week <= 0xFFFF else None
+        leap = round(status.leap_seconds) if abs(status.leap_seconds) < 100 else None
+        if week is not None and leap is not None:
+            seconds = times.time1_s if times.time_types & 0xF == pos.TIME_GPS else times.time1_s + leap
+            if times.time_types & 0xF in (pos.TIME_GPS, pos.TIME_UTC) and 0.0 <= seconds < WEEK_S:
+                self._status = week, round(seconds * SECOND_NS), leap
+        return [DeviceStatus(host_time_ns, {"solution": solution, **status._asdict()}, message="GRP3")]
+
+    def _imu(self, host_time_ns: int, data: bytes) -> Items:
+        self.counters.errors["imu_scale_unknown"] += 1
+        return []
+
+    def _event(self, host_time_ns: int, data: bytes) -> Items:
+        layout = pos.EVENT_1 if pos_name(data) == "GRP5" else pos.EVENT_2
+        found = layout.decode(data)
+        if found is None or not all(map(isfinite, found[0])):
+            return self._bad("bad_length" if found is None else "not_finite")
+        tag = self._tag(found[0])
+        if tag is None:
+            return []
+        channel = "EVENT1" if layout is pos.EVENT_1 else "EVENT2"
+        valid = tag.week is not None
+        name = pos_name(data)
+        return [EventMark(host_time_ns, tag, channel, rising=None, count=found[1].pulse, valid=valid, message=name)]
+
+    def _pps(self, host_time_ns: int, data: bytes) -> Items:
+        """Return the second of a pulse; group 7 is sent after each pulse, with its time."""
+        found = pos.PPS.decode(data)
+        if found is None or not all(map(isfinite, found[0])):
+            return self._bad("bad_length" if found is None else "not_finite")
+        tag = self._tag(found[0])
+        if tag is None:
+            return []
+        leap = self._status[2] if self._status is not None else None
+        valid = found[1].status == pos.PPS_SYNCHRONISED and tag.week is not None
+        tag = replace(tag, leap_seconds=leap)
+        return [TimeMessage(host_time_ns, tag, NamesEdge.PREVIOUS, bound=True, valid=valid, message="GRP7")]
+
+    def _general(self, host_time_ns: int, data: bytes) -> Items:
+        found = pos.GENERAL.decode(data)
+        if found is None:
+            return self._bad("bad_length")
+        return [DeviceStatus(host_time_ns, dict(found[1]._asdict()), message="GRP10")]
+
+
+DRIVERS = (
+    Driver(
+        protocol="gsof",
+        kind="gnss",
+        transports=STREAM_TRANSPORTS,
+        yields=(TimeMessage, GnssFix, InsSolution, DeviceStatus),
+        summary="Trimble GSOF reports, with the INS of an Applanix receiver (records 1 2 8 12 16 38 41 49 50 70)",
+        make_parser=GsofParser,
+        make_time_parser=lambda settings: GsofParser(settings, wanted=(TimeMessage,)),
+        names_edge=NamesEdge.PREVIOUS,
+    ),
+    Driver(
+        protocol="applanix-pos",
+        kind="gnss",
+        transports=STREAM_TRANSPORTS,
+        yields=(TimeMessage, InsSolution, EventMark, DeviceStatus),
+        summary="Applanix POS groups (1 2 3 5 6 7 10): INS, PPS and events of a POS AV, LV or MV",
+        make_parser=PosParser,
+        make_time_parser=lambda settings: PosParser(settings, wanted=(TimeMessage,)),
+        names_edge=NamesEdge.PREVIOUS,
+    ),
+)
