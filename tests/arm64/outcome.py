@@ -1,7 +1,7 @@
-"""What a processor makes of a log, for comparison with another's: ``python -m tests.arm64.outcome LOG FILE.npz``.
+"""Digests what this processor makes of a log, to compare it: ``python -m tests.arm64.outcome LOG FILE.npz``.
 
-Of each source the digest of all records that its decoder gives; the trajectory and the points in e and in the map as
-they are before a file rounds them.
+Each source has the digest of all records that its decoder gives. Trajectory and points, in e and on the map, are stored
+before a file rounds them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Lists the tests that run on the emulated ARM64, and those that cannot, each with the reason.
 
-What qemu's user mode lacks is not ours to test there: it hands system calls on to the host's kernel and does not know
-all of them. On real ARM64 all tests run by `make test` and `make test-slow`.
+Tests are left out if they need what qemu's user mode lacks: it passes system calls to the host's kernel and does not
+know all of them. On real ARM64 all tests run by `make test` and `make test-slow`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Tests that decoding, export, repair, georeferencing and navigation give the same on two processors.
 
-Everything up to the points in e is the same to the last bit on a host that has FMA: numba joins no product and sum, and
-glibc's sine and cosine are made of the same operations then. Beyond stand PROJ, whose compiler does join them on ARM64
-(a · b + c, rounded once) and on x86-64 does not, glibc's hypot, which is another there, and the order of BLAS's sums.
+Everything up to the points in e is equal to the last bit on a host that has FMA: numba fuses no product and sum, and
+glibc's sine and cosine then consist of the same operations. Later steps differ: PROJ's compiler fuses a · b + c on
+ARM64 but not on x86-64, glibc's hypot differs between the two, and so does the order of BLAS's sums.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Makes an outcome of a calibration by hand: a flight over houses, with numbers as of an adjustment.
 
-Nothing here is estimated: residuals are drawn, sigmas are said. It is what reports and records are tried on.
+Nothing is estimated: residuals are drawn, and sigmas are stated. Reports and records are tested on it.
 """
 
 from __future__ import annotations

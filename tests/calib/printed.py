@@ -1,6 +1,6 @@
 """Makes the worked adjustment of FORMULAS 6.5: 25 planes, 8 lines, 1522 points, each with its own pose.
 
-Its draws are made again in the same order; its geometry is written anew, for all points at once.
+The random draws are repeated in the same order; the geometry is written independently, for all points at once.
 """
 
 from __future__ import annotations

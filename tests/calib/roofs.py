@@ -1,6 +1,6 @@
 """Makes a flight by hand: straight lines over inclined planes, with ranges by intersection.
 
-Its points are computed with scipy's rotations from CONVENTIONS' formulas, not with georef's.
+Its points are computed with SciPy's rotations from the formulas of the conventions, not with georef.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """Runs `swath COMMAND` as a process forked from one that has loaded everything, ten times faster than a start.
 
-For tests of what a command does; that it starts at all, and what it loads, is shown by those that start it afresh.
+It serves tests of what a command does. Other tests start commands normally, and show that they start and what they
+load.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """A CAN adapter with switches, which python-can loads as an interface: ``can:faulty:<path of a socket>``.
 
-Who holds the other end sends SocketCAN frames of 16 bytes, which the bus gives; anything else is what the adapter
-says of itself, and the bus raises it. A file ``<path>.off`` beside the socket: the adapter cannot be opened.
+The test at the other end of the socket sends SocketCAN frames of 16 bytes, which the bus passes on. Any other message
+is an error of the adapter, which the bus raises. If a file ``<path>.off`` exists, the adapter cannot be opened.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Tests SocketCAN in a virtual machine whose kernel has it, as root: `pytest tests/drivers/guest_can.py`.
 
-Wants the modules vcan and can_raw loaded; for the last test can0 and can1 on one bus (two emulated kvaser_pci:
+The modules vcan and can_raw must be loaded. The last test needs can0 and can1 on one bus (two emulated kvaser_pci:
 qemu's ``-object can-bus,id=cb -device kvaser_pci,canbus=cb``, twice).
 """
 

@@ -1,6 +1,6 @@
 """Tests PPS on DCD beside data on one 16550 in a virtual machine, as root: pytest tests/drivers/guest_dcd.py
 
-Wants /dev/ttyS1 with a pulse of 0.1 s on DCD each second and NMEA at 38400 baud.
+/dev/ttyS1 must have a pulse of 0.1 s on DCD each second and NMEA at 38400 baud.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Tests kernel PPS on a real /dev/pps0 in a virtual machine, as root: `pytest tests/drivers/guest_pps.py`.
 
-Wants pps_sim.ko loaded: a pulse on each second of CLOCK_REALTIME, with the parameters on and drop.
+pps_sim.ko must be loaded: it makes a pulse on each second of CLOCK_REALTIME and has the parameters on and drop.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Checks every parser on a real recording: cut anywhere, byte by byte, damaged, with the same result each time.
 
-Streams (`check_stream`, `check_damage`): units end anywhere, so the same bytes give the same records and counters
-however they are cut. Packets (`check_packets`, `check_packet_damage`): units are whole, only batches vary.
+Units of streams (`check_stream`, `check_damage`) end anywhere, so the same bytes give the same records and counters
+however they are cut. Units of packets (`check_packets`, `check_packet_damage`) are whole; only batches vary.
 
-Records are compared in a canonical form: single events in their order, rows of array records (`ImuSamples`, …) in
-their order by type, whatever batches they came in. NaN equals NaN; padding of aligned dtypes does not count.
+Records are compared in a canonical form: single events in their order, and rows of array records (`ImuSamples`, …) in
+order by type, in any batches. NaN equals NaN; padding of aligned dtypes does not count.
 """
 
 from __future__ import annotations

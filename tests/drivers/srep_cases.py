@@ -1,6 +1,6 @@
 """Makes SREP for tests: the page's test vector, datagrams of a flight line, and a decoder written from the page.
 
-The decoder goes pulse by pulse with `struct` and whole numbers of any size; it shares nothing with the driver.
+The decoder works pulse by pulse with `struct` and integers of any size; it shares nothing with the driver.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Runs every fuzzing target for a time; an input that breaks one is minimised and kept in fuzz/crashes.
 
-Hypothesis chooses the inputs; with ``--guided`` libFuzzer does, by the code they reach, through atheris (Linux on
-x86-64; ``pip install atheris``), and what it learns stays under fuzz/corpus. ``--input FILE`` runs one input again.
+Hypothesis chooses the inputs. With ``--guided`` libFuzzer chooses them by the code that they reach, through atheris
+(Linux on x86-64; ``pip install atheris``), and keeps what it learns under fuzz/corpus. ``--input FILE`` runs one input
+again.
 """
 
 from __future__ import annotations

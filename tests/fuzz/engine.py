@@ -1,9 +1,9 @@
 """Defines a target and the rules for each of its inputs; Hypothesis chooses the inputs and minimises findings.
 
-A path is a seed and a few mutations, of the seed or of what the mutation before made; every input on it is checked.
-Hypothesis draws the seed, how many mutations there are, and the key of their random generators; it shrinks a path that
-fails to the fewest. Drawing each decision of a mutation makes an input cost several times as much, and drawing a key
-for each mutation repeats most of them, because Hypothesis varies what it has drawn before (decision 0031).
+A path is a seed and a few mutations, each of the seed or of the previous result; every input on it is checked.
+Hypothesis draws the seed, the number of mutations, and the key of their random generators, and reduces a failing path
+to the fewest mutations. Drawing each decision of a mutation would make an input cost several times as much; drawing a
+key for each mutation would repeat most of them, because Hypothesis varies what it has drawn before (decision 0031).
 """
 
 from __future__ import annotations

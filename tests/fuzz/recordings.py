@@ -1,7 +1,7 @@
 """Finds a driver's settings and its device's recordings by its page and its folder in fixtures/.
 
-The settings are those of the example on ``docs/devices/<protocol>.md``; a file they name is taken by its name, else by
-its suffix, from the driver's fixtures.
+The settings are those of the example in ``docs/devices/<protocol>.md``. A file that they name is found among the
+driver's fixtures by its name, or else by its suffix.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Runs every target for a short time, the same each time; ``make fuzz`` is the long run.
 
-The harness itself is tested too: sealed frames are good ones, and planted defects are found.
+The harness is tested too: sealed frames are valid, and planted defects are found.
 """
 
 from __future__ import annotations

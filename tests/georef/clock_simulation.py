@@ -1,13 +1,16 @@
 """Simulates an oscillator, receiver and wire: PPS edges and time messages as a host sees them, and the truth.
 
-Shares no code with swath.georef.timescales: it counts seconds itself, from calendar arithmetic of the standard
-library, and keeps the host's clock as an integral of its frequency. Everything random comes from one seed.
+It shares no code with swath.georef.timescales: it counts seconds with the standard library's calendar, and integrates
+the frequency of the host's clock. One seed determines everything random.
 
-Oscillator: a constant 23 ppm, a random walk of the frequency (2e-9 per √s unless said), and where asked temperature
-ramps of ± 0.5 ppm/min lasting 1 to 5 min, with 1 to 7 min between them.
-Edges: stamped with normal noise; a share of outliers 300 µs (normal) off, a share missing, a share of spurious edges
-anywhere in the second.
-Messages: a delay with its own jitter, a share of stalls up to 1.5 s; in order (a stalled one holds back the next).
+The oscillator has a constant 23 ppm, a random walk of frequency (2e-9 per √s by default), and on request temperature
+ramps of ± 0.5 ppm/min that last 1 to 5 min, with 1 to 7 min between them.
+
+The edges have stamps with normal noise; some are outliers 300 µs (normal) off, some are missing, and some are spurious
+and anywhere in the second.
+
+The messages have a delay with jitter, and some stall for up to 1.5 s. They stay in order, so a stalled one holds back
+the next.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Tests that gpsd, fed by ``swath replay`` through a pseudo-terminal, agrees on every epoch.
 
-gpsd decodes by its own code. Compared are what it tells its clients (TPV) and what our decoders say, to the last
-digit that the receiver's message or gpsd's JSON holds, whichever is coarser.
+gpsd decodes with its own code. Its reports to clients (TPV) are compared with our decoders, to the last digit of the
+receiver's message or of gpsd's JSON, whichever is coarser.
 """
 
 from __future__ import annotations

@@ -1,8 +1,7 @@
 """Computes ISO/TS 19159-2 Eq. 10 with the model of the conventions directly, by pyproj and SciPy only.
 
-It takes what a scanner's packets say, the true calibration as a file says it and the true trajectory at the IMU's
-rate, and gives ground points: the check that the virtual aircraft means what CONVENTIONS says. It shares no line with
-`sim`.
+It takes a scanner's packets, the true calibration from its file and the true trajectory at the IMU's rate, and gives
+ground points. This checks that the virtual aircraft follows the conventions; it shares no line with `sim`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Tests the virtual aircraft's chain from beam to ground by the formula sheet (FORMULAS 2.1 and 5.2).
 
-The columns of 5.2 are taken by differences of the whole chain; their step is far above rounding and far below what
-curvature would show in the digits compared.
+The derivatives of 5.2 come from differences of the whole chain, whose step is far above rounding, and so small that
+curvature does not show in the digits compared.
 """
 
 from __future__ import annotations

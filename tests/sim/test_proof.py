@@ -1,6 +1,6 @@
 """Tests that noiseless packets, decoded by the drivers and placed by `tests.sim.direct`, hit the true points.
 
-The bound of each return is 1 mm and half the packet's own quanta carried to the ground: of range, angle and time.
+The bound of each return is 1 mm plus half of the packet's quanta of range, angle and time, projected to the ground.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Runs inside the machine: recorder, network interfaces, senders. The host's half is `tests.vm.crew`.
 
-It imports little: where the processor is emulated, pytest alone takes longer to load than the machine to boot.
+It imports little, because on an emulated processor pytest alone takes longer to load than the machine to boot.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Runs a small virtual machine: the host's root read-only under a tmpfs, one command, its status.
 
-`run` boots it, waits for the command and hands its status and words back; `start` leaves it running, so that a test may
-talk to it or cut its power. `/vm` in the machine is the folder ``shared`` of the host; the project's tree lies where it
-lies on the host.
+`run` boots it, waits for the command and returns its status and output. `start` leaves it running, so that a test can
+talk to it or cut its power. `/vm` in the machine is the folder ``shared`` of the host; the project's tree has the same
+path as on the host.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Tests a flight with the virtual aircraft on this computer and the aircraft's computer in the machine.
 
-Its scanner's datagrams come over the machine's network card, its receiver's messages over a 16550, its IMU's frames
-over SocketCAN, its pulses at /dev/pps0. qemu has no CAN but what the host's kernel has, so that frames cross as a
-stream and are sent to vcan0 in the machine; the pulses are those of `guest/pps_sim.c`, steered to where they are here.
+The scanner's datagrams come over the machine's network card, the receiver's messages over a 16550, the IMU's frames
+over SocketCAN, and the pulses at /dev/pps0. qemu has no CAN beyond the host kernel's, so frames cross as a stream and
+are sent to vcan0 in the machine. The pulses are those of `guest/pps_sim.c`, adjusted to the phase outside.
 """
 
 from __future__ import annotations

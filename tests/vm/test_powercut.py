@@ -1,7 +1,7 @@
 """Tests power cuts while a full sensor set is recorded: durable data are there, and little more is lost.
 
-The machine keeps time of its own: when what was sent, and when the kernel said what is on the disk, is written down
-in it, on the host, which the cut spares. The recording is that of the installed service, from its start at boot.
+The machine notes on the host, which the cut spares, when it sent what, and when the kernel declared it durable, in its
+own time. The installed service records, from its start at boot.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Tests that a foreign log's false claims are reported in a line, take little memory, and are not copied.
 
-All files go through all commands in one process, the peak of its memory reset before each (proc(5), clear_refs).
+All commands read all files in one process, whose peak memory is reset before each (proc(5), clear_refs).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Tests kill -9 at a hundred random moments: what was sent half a second before is in the log.
 
-Half a second of a machine that runs: what a bystander on the same machine was held up does not count.
+The half second counts only time in which the machine ran: delays of a bystander process are subtracted.
 """
 
 from __future__ import annotations

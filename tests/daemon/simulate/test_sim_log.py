@@ -1,6 +1,6 @@
 """Tests a simulated log: it is what a recorder on board would have written, with the same bytes each time.
 
-The flight is a stand-in, so that what is looked at here is the way into the log alone.
+The flight is a stand-in, because only the way into the log is tested.
 """
 
 from __future__ import annotations

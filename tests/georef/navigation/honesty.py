@@ -1,8 +1,8 @@
 """Tests whether sigmas equal errors: normalised estimation errors squared (NEES) over many flights.
 
-Errors of neighbouring moments are alike, so that a flight of many samples has few independent ones. Their number is
-found from the flights themselves: with v₁ the variance of the NEES at one moment and v the variance, from flight to
-flight, of its mean over a flight, a flight counts v₁ / v samples.
+Errors at neighbouring moments are correlated, so that a flight of many samples has few independent ones. Their number
+follows from the flights: with v₁ the variance of the NEES at one moment, and v the variance from flight to flight of
+its mean over a flight, a flight counts as v₁ / v samples.
 """
 
 from __future__ import annotations

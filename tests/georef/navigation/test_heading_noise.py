@@ -1,6 +1,6 @@
 """Tests which part of a second antenna's heading errors lasts, and how long, as estimated from a flight.
 
-Twenty flights of each kind are `python -m benchmarks.navigation_honesty --headings`.
+`python -m benchmarks.navigation_honesty --headings` flies twenty flights of each kind.
 """
 
 from __future__ import annotations

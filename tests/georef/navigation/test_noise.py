@@ -1,6 +1,6 @@
 """Tests the receiver's noise estimated from a flight: scales by kind, fix type and axis; the lasting share.
 
-Fifty flights of each kind are `python -m benchmarks.navigation_honesty --receivers`.
+`python -m benchmarks.navigation_honesty --receivers` flies fifty flights of each kind.
 """
 
 from __future__ import annotations

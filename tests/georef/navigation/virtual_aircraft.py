@@ -1,7 +1,7 @@
 """Provides the virtual aircraft's flights, inertial units and receivers for navigation, without wires and logs.
 
-The way is flown once by `swath.sim.flight.trajectory`; units and receivers draw their errors anew with each seed, as
-`swath.sim.imu.sensors` and `swath.sim.gnss.receiver` make them.
+`swath.sim.flight.trajectory` flies the path once; units and receivers draw new errors with each seed, as in
+`swath.sim.imu.sensors` and `swath.sim.gnss.receiver`.
 """
 
 from __future__ import annotations

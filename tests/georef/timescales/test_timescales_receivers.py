@@ -1,7 +1,7 @@
 """Tests real receivers' time messages on one clock: UTC with leap seconds and GPS week name one second.
 
-The recordings carry no arrival times, so the edges are put where the receiver's own seconds begin and its messages
-50 ms later; what is tested is that all kinds of messages agree, and that the label is the receiver's second.
+The recordings have no arrival times, so edges are put at the beginning of the receiver's own seconds and messages 50 ms
+later. The tests show that all kinds of messages agree, and that the label is the receiver's second.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Tests that no second is wrong while LOCKED or HOLDOVER, over 1e5 simulated seconds with all faults.
 
-Simulated (clock_simulation.py): 23 ppm, a random walk of the frequency of 2e-9/√s, ramps of 0.5 ppm/min where said;
-stamps of 1.5 µs or 300 µs; 1 % outliers of 300 µs, 2 to 10 % missing and 1 to 5 % spurious edges; messages 5 ms to
-0.9 s late with up to 20 % stalls to 1.5 s. A wrong second is an error above 0.5 s.
+The simulation (clock_simulation.py) has 23 ppm, a random walk of frequency of 2e-9/√s, and ramps of 0.5 ppm/min in some
+cases; stamps of 1.5 µs or 300 µs; 1 % outliers of 300 µs, 2 to 10 % missing and 1 to 5 % spurious edges; messages 5 ms
+to 0.9 s late with up to 20 % stalls of up to 1.5 s. A wrong second is an error above 0.5 s.
 """
 
 from __future__ import annotations

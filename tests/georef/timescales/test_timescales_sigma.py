@@ -1,9 +1,9 @@
 """Tests that the clock's sigma is honest, and how good the time is.
 
-Simulated: frequency 23 ppm with a random walk of 2e-9/√s, with and without temperature ramps of 0.5 ppm/min (1 to 5 min
-long, 1 to 7 min apart); stamps of 1.5 µs (kernel) and 300 µs (user space); 1 % outliers, 2 % missing, 1 % spurious
-edges. Three oscillators of 90 min each; the first 15 min, in which noise and wander are still being learnt, are left
-out. Holdover: at every second, the time 60 s ahead as if no edge came any more.
+The simulation has 23 ppm with a random walk of frequency of 2e-9/√s, with and without temperature ramps of 0.5 ppm/min
+(1 to 5 min long, 1 to 7 min apart); stamps of 1.5 µs (kernel) and 300 µs (user space); 1 % outliers, 2 % missing, 1 %
+spurious edges. Three oscillators run for 90 min each; the first 15 min, in which noise and wander are still learnt, are
+left out. In holdover the time 60 s ahead is asked at every second, as if no further edge came.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
     lines.py CAN_INTERFACE CAN_PORT CLOCK_HOST:CLOCK_PORT
 
-Frames of 16 bytes (struct can_frame) come one after the other from whoever connects to CAN_PORT. The clock is asked
-over UDP: sixteen bytes come back, its wall clock and the phase of its pulses within its second (-1: none yet), both
-in ns; pps_sim is steered so that its pulses are there, anew every two seconds.
+Whoever connects to CAN_PORT sends frames of 16 bytes (struct can_frame), one after the other. The clock is asked over
+UDP and answers with sixteen bytes: its wall clock, and the phase of its pulses within its second (-1: none yet), both
+in ns. pps_sim is adjusted every two seconds so that its pulses have that phase.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
     sensors.py FOLDER [--udp PORT:RATE] [--serial DEVICE] [--can INTERFACE:RATE] [--seconds S]
 
-FOLDER/sent is one line a tenth of a second: CLOCK_MONOTONIC in ns, then the number of units sent before that by
-udp, serial, can; it is written through at once, so that it outlives a power cut where FOLDER is the host's.
+FOLDER/sent gets a line each tenth of a second: CLOCK_MONOTONIC in ns, then the number of units sent before that by udp,
+serial, can. It is written through at once, so that it survives a power cut if FOLDER is the host's.
 """
 
 from __future__ import annotations

@@ -2,10 +2,10 @@
 
     witness.py LOGS FILE
 
-A line of FILE is ``<CLOCK_MONOTONIC in ns at the sync's begin> <at its end> <bytes> <log>``: bytes that the log had
-before the sync began, so that its end makes them durable. FILE.begun has the begin of each, also of one that the power
-did not let end. The kernel's tracing is the witness, not the recorder; it is switched on by the kernel's command line:
-a switch rewrites running code, which the emulator at times does not notice.
+A line of FILE is ``<CLOCK_MONOTONIC in ns at the sync's begin> <at its end> <bytes> <log>``: the log had these bytes
+before the sync began, so its end makes them durable. FILE.begun has the beginning of each sync, also of one that the
+power cut interrupted. The kernel's tracing is the witness, not the recorder. The kernel's command line turns it on,
+because turning it on later rewrites running code, which the emulator sometimes misses.
 """
 
 from __future__ import annotations

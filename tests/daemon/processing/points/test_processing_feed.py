@@ -1,6 +1,6 @@
 """Tests that a log's messages become the same points, however it is cut and while it grows.
 
-One short virtual flight with a line scanner and a spinning head beside each other, and the receiver's own INS.
+The log is of a short virtual flight with a line scanner, a spinning head, and the receiver's own INS.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Tests noiseless flights of every kind of scanner, georeferenced with true trajectory and calibration.
 
-Every return within 1 mm and half the packet's own quanta (range, angle, time) carried to the ground; nothing else is
-allowed for. Each kind is flown once with the air off and once with it on: ranges as of vacuum, bent beams.
+Every return is within 1 mm plus half of the packet's quanta (range, angle, time) projected to the ground. Each kind is
+flown once without air and once with it, where ranges refer to vacuum and beams are bent.
 """
 
 from __future__ import annotations

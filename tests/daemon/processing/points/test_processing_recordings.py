@@ -1,7 +1,7 @@
 """Tests recordings of real heads through parser, geometry and sensor model against other decoders' points.
 
-The body stands at a place on earth with an attitude; points_e come back to the head's frame by PROJ and SciPy. How far
-the others may be apart is what the parsers' own tests found: of the decoders' ways, not of this one.
+The body is at a place on earth with an attitude; PROJ and SciPy convert points_e back to the head's frame. The
+differences allowed are those of the parsers' own tests, which come from the decoders' methods.
 """
 
 from __future__ import annotations

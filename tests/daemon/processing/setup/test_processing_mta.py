@@ -1,7 +1,7 @@
 """Tests pulses in air from the wire to points: SREP with byte 15 = 255 and the true pulse of every echo.
 
-1200 m above hills, two to four pulses in the air, a pulse rate that jitters, a tick that is no whole nanosecond, four
-pulses in ten without a return, lost datagrams. Truth is made here, with PROJ and SciPy.
+The flight is 1200 m above hills, with two to four pulses in the air, a jittering pulse rate, a tick that is no whole
+nanosecond, four pulses in ten without a return, and lost datagrams. The truth is computed here with PROJ and SciPy.
 """
 
 from __future__ import annotations

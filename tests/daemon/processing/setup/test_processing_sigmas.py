@@ -1,7 +1,7 @@
 """Tests that sigmas are honest, with returns of virtual flights whose errors are drawn as stated.
 
-Each draw has its own errors of trajectory, calibration, range, angle and time, all constant over a strip but the last
-three; one return of it counts, so that draws are independent and the normalised squared error has three degrees of
+Each draw has its own errors of trajectory, calibration, range, angle and time; the first two are constant over a strip.
+One return of each draw counts, so that draws are independent and the normalised squared error has three degrees of
 freedom (FORMULAS 6.5).
 """
 

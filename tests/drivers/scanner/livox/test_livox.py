@@ -1,7 +1,7 @@
 """Tests Livox packets: bytes and points computed by hand, every type of point and time, cut and damaged.
 
-No recording exists in the collection. The time of the first packet and its form are those of a report by a user
-(Livox-SDK #130: "21-6-8 8:1661272021"); figures are computed by hand or by `datetime`.
+The collection has no recording. Time and form of the first packet are those of a user's report (Livox-SDK #130: "21-6-8
+8:1661272021"); the figures are computed by hand or by `datetime`.
 """
 
 from __future__ import annotations
