@@ -56,7 +56,7 @@ def test_numbers_of_a_recording_match_a_direct_parse(tmp_path: Path) -> None:
 
 
 def test_messages_are_listed_and_a_silent_second_antenna_is_named(tmp_path: Path) -> None:
-    """Raw measurements and NMEA of a u-blox receiver; the NMEA has no heading."""
+    """The log holds raw measurements and NMEA of a u-blox receiver, whose NMEA has no heading."""
     table = '[session]\nname = "n"\ndirectory = "logs"\n[gnss.rover]\ntransport = "serial:/dev/ttyUSB0?baud=115200"\n'
     arms = "lever_arm_m = [0.0, -0.5, 0.0]\nsecondary_lever_arm_m = [0.0, 0.5, 0.0]\n"
     config = write_config(tmp_path, f'{table}protocol = "ubx"\n{arms}')

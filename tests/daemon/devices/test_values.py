@@ -117,7 +117,7 @@ def test_pulses_without_a_return_and_odd_ranges_are_counted() -> None:
 
 
 def test_the_share_of_a_real_head_is_that_of_its_packets() -> None:
-    """Against the distances that are not zero in the packets themselves (VLP-16 manual, 9.3.1.3)."""
+    """The share is counted from the distances in the packets that are not zero (VLP-16 manual, 9.3.1.3)."""
     packets = [
         unit.data for unit in read_pcap(ROOT / "fixtures/velodyne/mrpt_vlp16_gps.pcap.gz") if len(unit.data) == 1206
     ]
@@ -160,7 +160,7 @@ def check(text: str, folder: Path, seconds: float) -> dict[str, Report]:
 
 
 def test_a_receiver_and_an_imu_on_real_wires_are_judged(tmp_path: Path) -> None:
-    """A fix on a pty; on a CAN bus an IMU whose z axis points up, with a PPS that nothing shows."""
+    """A pty carries a fix, and a CAN bus an IMU whose z axis points up and whose PPS nothing confirms."""
 
     def epoch(second: int) -> bytes:
         clock = f"1015{second % 60:02}.00"

@@ -1,4 +1,4 @@
-"""Unicore N4 logs: binary and ASCII alike, published packets, times, headings, NMEA beside them, set-up."""
+"""Tests Unicore N4 logs in binary and ASCII: published packets, times, headings, NMEA beside them, set-up."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def parse(*data: bytes, **config: Any) -> tuple[list[Record], UnicoreParser]:
 
 
 def test_a_rectime_has_the_bytes_and_checksum_of_a_published_packet() -> None:
-    """A UM980's own packet in both forms, in satpulse's tests (uncmsg): its checksums are b3998b61 and 9f81d9db."""
+    """A UM980's own packet is in satpulse's tests (uncmsg) in both forms, with checksums b3998b61 and 9f81d9db."""
     frame = encode_log("RECTIME", (TIME,), WEEK, MS)
     by_hand = bytes.fromhex("aa44b5 61 6600 2c00 00 a0 4b09 88a70a16 00000000 00 12 1200 00000000")
     assert frame[: len(by_hand)] == by_hand
@@ -89,7 +89,7 @@ def test_ascii_and_binary_give_the_same_records(name: str) -> None:
 
 
 def widened(records: list[Record]) -> list[Record]:
-    """Return records without the covariances, which stand in fewer digits."""
+    """Return records without covariances, which have fewer digits in ASCII than in binary."""
     return [
         replace(record, position_cov_l=None, velocity_cov_l=None) if isinstance(record, GnssFix) else record
         for record in records
@@ -188,7 +188,7 @@ def stream() -> bytes:
 
 
 def test_the_fixture_is_what_the_encoder_writes() -> None:
-    """Ten seconds of a UM982 in both forms, with NMEA and RTCM beside it; made here, as no recording was available."""
+    """The fixture holds ten seconds of a UM982 in both forms with NMEA and RTCM; no recording was available."""
     made = b""
     for second in range(10):
         at = MS + 1000 * second

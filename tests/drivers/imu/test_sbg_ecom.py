@@ -1,4 +1,4 @@
-"""SBG sbgECom, of which no recording was available: frames by hand after the maker's document, and by the encoder."""
+"""Tests SBG sbgECom by frames written by hand from the maker's document and by the encoder: no recording exists."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def heading(state: int = 0x40) -> bytes:
 
 
 def flight() -> bytes:
-    """Return two seconds of a unit's logs: the fixture, from which other inputs are made by mutation."""
+    """Return two seconds of a unit's logs, the content of the fixture, from which the fuzzer makes other inputs."""
     pieces = [encode_log(wire.STATUS, 0, 3, 0, 0xFFFF, 0x0F, more=bytes(11)), b"$PSBGI,0*00\r\n"]
     for cycle in range(100):
         stamp_us = 4_294_000_000 + 20_000 * cycle  # wraps
@@ -119,7 +119,7 @@ def rows_of(records: list[Record], kind: Any) -> Any:
 
 
 def test_a_frame_written_by_hand() -> None:
-    """IMU_SHORT of binaryMessages.md byte by byte, its CRC by the loop of binaryProtocol.md."""
+    """IMU_SHORT follows binaryMessages.md byte by byte, and its CRC comes from the loop in binaryProtocol.md."""
     body = bytes.fromhex("2C 00 2000 40420F00 FF03 00000000 00001000 000064FF 00008000 00000000 000000FC 8015")
     crc = 0
     for byte in body:
@@ -136,7 +136,7 @@ def test_a_frame_written_by_hand() -> None:
 
 
 def test_logs_have_the_sizes_of_the_makers_document() -> None:
-    """Those that firmware has extended end before the extension."""
+    """A layout ends before the fields that later firmware added."""
     sizes = {number: layout.size for number, layout in wire.LAYOUTS.items()}
     assert {number: sizes[number] for number in (3, 44, 7, 8)} == {3: 58, 44: 32, 7: 36, 8: 72}
     assert sizes[2] == 21
@@ -259,7 +259,7 @@ def test_solutions_need_both_logs_of_one_stamp() -> None:
 
 
 def test_the_quaternion_turns_the_body_to_north_east_down() -> None:
-    """A quarter to the right about z (down) from north is east; then nose up is positive pitch."""
+    """A quarter turn to the right about z (down) leads from north to east, and pitch is positive with the nose up."""
     for (w, x, y, z), wanted in (
         ((np.cos(0.1), np.sin(0.1), 0, 0), (0.2, 0, 0)),
         ((np.cos(0.1), 0, np.sin(0.1), 0), (0, 0.2, 0)),

@@ -259,7 +259,7 @@ def sender_at(address: str) -> Iterator[socket.socket]:
 
 
 def test_two_senders_to_one_port_are_two_transports_on_one_socket() -> None:
-    """Two heads and a stranger, interleaved: each unit is at its head, the stranger is counted once and named."""
+    """Two heads and a stranger send in turn; each unit goes to its head, and the stranger is counted once and named."""
     port = free_port()
     left, right = (transport(f"?source=127.0.0.{head}", port=port) for head in (2, 3))
     left.open()

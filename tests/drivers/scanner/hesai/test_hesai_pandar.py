@@ -1,4 +1,4 @@
-"""Pandar40P, Pandar64, Pandar128 and OT128: packets put together by hand from the SDK's structures, and the encoder."""
+"""Tests Pandar40P, Pandar64, Pandar128, OT128 by packets made by hand from the SDK's structures and by the encoder."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def pandar40p_by_hand(mode: int, sequence: int | None, utc: bytes = NOON_2000) -
 
 
 def test_a_pandar40p_packet_computed_by_hand_is_decoded() -> None:
-    """Laser 1 of the last block: 28.58 and 42.22 µs before the stamp; of the first 9 · 55.56 µs earlier."""
+    """Laser 1 of the last block fires 28.58 µs + 42.22 µs before the stamp, and blocks are 55.56 µs apart."""
     for sequence, length in ((None, 1262), (7, 1266)):
         unit = pandar40p_by_hand(MODE_STRONGEST, sequence)
         assert len(unit) == length
@@ -65,7 +65,7 @@ def test_a_pandar40p_packet_computed_by_hand_is_decoded() -> None:
 
 
 def test_dual_returns_of_a_pandar40p_are_paired() -> None:
-    """Blocks 1 and 2 are one firing, 4 mm apart: the farther is the last; of equal light the second is strongest."""
+    """Blocks 1 and 2 are one firing: the return 4 mm farther is the last, and of equal ones the second is strongest."""
     unit = packet(PANDAR40P, MODE_LAST_STRONGEST, ranges=np.tile([[1001], [1000]], (5, 40)), light=9)
     rows = decode(unit, PANDAR40P)
     assert len(rows) == 400
@@ -76,14 +76,14 @@ def test_dual_returns_of_a_pandar40p_are_paired() -> None:
 
 
 def test_a_year_of_zero_is_2000_in_the_older_packets() -> None:
-    """A head without a receiver counts from there; the newer protocols put seconds since 1970 behind a year of 0."""
+    """A head without a receiver counts from 2000; newer protocols put seconds since 1970 behind a year of 0."""
     rows = decode(pandar40p_by_hand(MODE_STRONGEST, 7, bytes((0, 1, 1, 0, 0, 1))), PANDAR40P)
     start_ns = int(dt.datetime(2000, 1, 1, 0, 0, 1, 250_000, tzinfo=dt.UTC).timestamp() * 1000) * 1_000_000
     assert rows["device_time_ns"][-1] - start_ns == -28_580 - 3_620
 
 
 def test_a_pandar64_packet_computed_by_hand_is_decoded() -> None:
-    """Six blocks of 64 lasers behind a header of 8 bytes (HS_LIDAR_L64_Header)."""
+    """The packet has six blocks of 64 lasers behind a header of 8 bytes (HS_LIDAR_L64_Header)."""
     block = b"".join(struct.pack("<HB", 2000 + laser, laser) for laser in range(64))
     body = b"".join(struct.pack("<H", 1000 + 20 * number) + block for number in range(6))
     unit = b"\xee\xff" + bytes((64, 6, 0, 4, 0, 0)) + body + old_tail(MODE_STRONGEST, 250_000, NOON_2000)
@@ -127,7 +127,7 @@ def packet_128_by_hand(operation: int, azimuth_flag: int, ranges: tuple[int, int
 def test_firing_times_of_128_lasers_follow_the_tables(
     head: HesaiHead, operation: int, azimuth_flag: int, ranges: tuple[int, int], want: dict[tuple[int, int], int]
 ) -> None:
-    """Tables of HesaiLidar_SDK_2.0; a range of 712 units of 4 mm is nearer than 2.85 m."""
+    """Times come from the tables of HesaiLidar_SDK_2.0; 712 units of 4 mm are less than 2.85 m, so count as near."""
     rows = decode(packet_128_by_hand(operation, azimuth_flag, ranges), head)
     times = rows["device_time_ns"].reshape(2, 128) - NOON_NS
     assert {at: int(times[at[1] - 1, at[0] - 1]) for at in want} == want
@@ -136,13 +136,13 @@ def test_firing_times_of_128_lasers_follow_the_tables(
 
 
 def test_codes_among_the_ranges_of_an_ot128_are_no_returns() -> None:
-    """nebula names them: 1 too near, 2 too near for far lasers, 3 no return."""
+    """Nebula gives their meaning: 1 is too near, 2 too near for far lasers, and 3 no return."""
     assert len(decode(packet_128_by_hand(2, 0, (3, 4)), OT128)) == 128
     assert len(decode(packet_128_by_hand(2, 0, (3, 4)), PANDAR128)) == 256
 
 
 def test_optional_parts_of_128_lasers_are_found_by_the_flags() -> None:
-    """The lengths of all combinations tell them apart, but confidence, weight and light, which are alike."""
+    """Each combination has a length of its own, except that confidence, weight and light take the same space."""
     layouts = PANDAR128.layouts()
     assert len(layouts) == 16 * 4
     assert {861, 1117} <= set(layouts)

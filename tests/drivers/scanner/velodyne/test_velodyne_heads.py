@@ -109,9 +109,9 @@ def test_vlp32c_agrees_with_velodyne_decoder() -> None:
 
 
 def test_vlp32c_agrees_with_the_golden_cloud_of_nebula() -> None:
-    """Laser by elevation and raw distance of each point are ours, and so is its azimuth as nebula turns it on.
+    """Each point's laser (by elevation) and raw distance equal ours, and so does its azimuth rotated as nebula does it.
 
-    It lets every laser fire 2.304 µs after the one before (the manual: every pair), and some blocks it does not turn.
+    Nebula lets each laser fire 2.304 µs after the last (the manual: each pair), and leaves some blocks unrotated.
     """
     parser = make_parser(VLP32C, "calib_VLP32.yaml")  # as nebula has it: without vertical corrections
     beams = parser.beams
@@ -144,7 +144,7 @@ def test_vlp32c_agrees_with_the_golden_cloud_of_nebula() -> None:
 
 
 def test_vlp32c_gaps_left_by_the_recorder_are_counted() -> None:
-    """The bag holds three scans' beginnings 50 ms apart: packets of the other half turn were filtered out."""
+    """The bag has the beginnings of three scans, 50 ms apart: packets of the other half turn were filtered out."""
     units = payloads(VLP32C_CAPTURE)
     parser = make_parser(VLP32C)
     rows = returns_of(feed(parser, units))
@@ -169,7 +169,7 @@ def test_vlp32c_returns_do_not_depend_on_how_batches_are_cut() -> None:
 
 
 def test_vlp32c_firing_times_follow_the_manual() -> None:
-    """VLP-32C manual 9.4: 55.296 µs · sequence + 2.304 µs · (laser / 2), in dual return a sequence in two blocks."""
+    """VLP-32C manual 9.4 gives 55.296 µs · sequence + 2.304 µs · (laser / 2); dual return has two blocks a sequence."""
     times = decode(packet(VLP32C), VLP32C)["device_time_ns"].reshape(12, 32) - 2_000_000
     for block, laser, want_us in ((0, 0, 0.0), (0, 1, 0.0), (0, 31, 34.56), (1, 0, 55.296), (11, 31, 642.816)):
         assert times[block, laser] == round(1000 * want_us)
@@ -178,7 +178,7 @@ def test_vlp32c_firing_times_follow_the_manual() -> None:
 
 
 def test_vlp32c_precision_azimuth_follows_the_manual() -> None:
-    """VLP-32C manual 9.5: azimuth + gap · 2.304 µs · K / 55.296 µs, K one of 16 pairs, and the laser's offset."""
+    """VLP-32C manual 9.5 gives azimuth + gap · 2.304 µs · K / 55.296 µs + the laser's offset, for K of 16 pairs."""
     rows = decode(packet(VLP32C, first=35_990), VLP32C)
     want = 359.9 + 0.2 * (np.arange(12)[:, np.newaxis] + np.arange(32) // 2 * 2.304 / 55.296)
     np.testing.assert_allclose(np.degrees(rows["encoder_rad"]), want.reshape(-1) % 360, atol=1e-9)
@@ -190,7 +190,7 @@ def test_vlp32c_precision_azimuth_follows_the_manual() -> None:
 
 
 def test_vls128_firing_times_follow_the_manual() -> None:
-    """VLS-128 manual 9.4: groups of eight each 2.665 µs, one left out after the eighth, sequences 53.3 µs, −8.7 µs."""
+    """By VLS-128 manual 9.4 a sequence starts at −8.7 µs and has eight lasers each 2.665 µs, none in the ninth slot."""
     times = decode(packet(VLS128), VLS128)["device_time_ns"].reshape(3, 128) - 2_000_000
     for sequence, laser, want_us in (
         (0, 0, -8.7),
@@ -212,7 +212,7 @@ def test_vls128_firing_times_follow_the_manual() -> None:
 
 
 def test_vls128_packet_layout_follows_the_manual() -> None:
-    """Four blocks a sequence, a bank each; in dual return each bank's last and strongest, then four empty blocks."""
+    """A sequence has a block for each of four banks; dual return has two for each, and four empty blocks at the end."""
     single, dual = packet(VLS128), packet(VLS128, MODE_DUAL)
     assert [single[at : at + 2].hex() for at in range(0, 1200, 100)] == 3 * ["ffee", "ffdd", "ffcc", "ffbb"]
     pairs = ["ffee", "ffee", "ffdd", "ffdd", "ffcc", "ffcc", "ffbb", "ffbb"]
@@ -231,7 +231,7 @@ def test_vls128_packet_layout_follows_the_manual() -> None:
 
 
 def test_vls128_design_angles_follow_the_manual() -> None:
-    """128 lasers from −25° to +15°, eight azimuth offsets (manual 9.3.1.2); laser 36 looks down most."""
+    """The manual (9.3.1.2) has 128 lasers from −25° (laser 36) to +15°, with eight azimuth offsets."""
     beams = VLS128.beams
     assert len(beams) == len(np.unique(beams.elevation_deg)) == 128
     assert (beams.elevation_deg.min(), beams.elevation_deg.max()) == (-25.0, 15.0)
@@ -242,7 +242,7 @@ def test_vls128_design_angles_follow_the_manual() -> None:
 
 
 def test_vls128_dual_return_uses_the_rotation_since_the_previous_packet() -> None:
-    """A dual-return packet has one azimuth: the rotation is that since the last one, also past a lost packet."""
+    """A dual-return packet has one azimuth, so the rotation comes from the previous packet, also after a lost one."""
     number = np.array([0, 1, 2, 5, 6, 7, 8])
     azimuth = (35_970 + 20 * number) % 36_000
     azimuth[-2:] += 9_000  # the field of view steps on
@@ -261,7 +261,7 @@ def test_vls128_dual_return_uses_the_rotation_since_the_previous_packet() -> Non
 
 
 def test_hdl32e_firing_times_follow_the_manual() -> None:
-    """HDL-32E manual, appendix E: block · 46.08 µs + laser · 1.152 µs, 542.592 µs from the first firing to the last."""
+    """Appendix E of the manual gives block · 46.08 µs + laser · 1.152 µs, and 542.592 µs from first to last firing."""
     times = decode(packet(HDL32E), HDL32E)["device_time_ns"].reshape(12, 32) - 2_000_000
     for block, laser, want_us in ((0, 0, 0.0), (0, 1, 1.152), (0, 31, 35.712), (1, 0, 46.08), (11, 31, 542.592)):
         assert times[block, laser] == round(1000 * want_us)
@@ -270,7 +270,7 @@ def test_hdl32e_firing_times_follow_the_manual() -> None:
 
 
 def test_hdl32e_lasers_follow_the_firing_order() -> None:
-    """HDL-32E manual, laser firing sequence: the lowest first, then both banks of 16 in turn, 4/3° apart."""
+    """By the manual's firing sequence the lowest laser is first, then both banks of 16 alternate, in steps of 4/3°."""
     elevation = HDL32E.beams.elevation_deg
     np.testing.assert_allclose(elevation[0::2], -92 / 3 + 4 / 3 * np.arange(16), atol=0.01)
     np.testing.assert_allclose(elevation[1::2], -28 / 3 + 4 / 3 * np.arange(16), atol=0.01)
@@ -298,7 +298,7 @@ def test_returns_of_every_head_do_not_depend_on_how_batches_are_cut() -> None:
 
 
 def test_a_puck_hi_res_has_its_own_angles() -> None:
-    """Lasers 0 and 7 at 10 m: −10° and 7.4 mm up, 4.667° and 3.7 mm down, by table 9-1; a VLP-16 refuses them."""
+    """Table 9-1 puts laser 0 at −10° and 7.4 mm up, and laser 7 at 4.667° and 3.7 mm down; a VLP-16 refuses them."""
     units = payloads("velodyne/made_vlp16_hires.pcap.gz")
     parsers = {protocol: make_parser(head) for protocol, head in HEADS.items()}
     rows = {
@@ -416,7 +416,7 @@ def full_table(unit: str) -> bytes:
 
 @pytest.mark.parametrize("unit", ["yaml", "xml"])
 def test_full_calibration_table_matches_the_formula_sheet(unit: str) -> None:
-    """FORMULAS 2.2: 50 m at azimuth 123°, ω −9°, rot 1.2°, v 0.2 m, h 0.026 m, ΔR 0.05 m."""
+    """The point is that of FORMULAS 2.2 for 50 m, azimuth 123°, ω −9°, rot 1.2°, v 0.2 m, h 0.026 m, ΔR 0.05 m."""
     beams = read_calibration(full_table(unit), VLP16)
     rows = np.zeros(1, dtype=RETURN_DTYPE)
     rows["range_m"], rows["encoder_rad"], rows["channel"] = 50.0, np.radians(123.0), 7
