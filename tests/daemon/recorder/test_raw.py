@@ -1,4 +1,4 @@
-"""Devices without a driver: recorded as they come over every wire, healthy everywhere, read once there is a driver."""
+"""Tests devices without a driver: recorded over every wire, healthy everywhere, read once there is a driver."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_raw_devices_are_recorded_over_every_wire_and_healthy_everywhere(tmp_pat
 
 
 def test_a_raw_recording_is_read_once_there_is_a_driver(tmp_path: Path) -> None:
-    """A unit as [raw.unit] and a receiver as protocol raw; a later configuration names their protocols."""
+    """A unit is recorded as [raw.unit], a receiver as protocol raw; a later configuration names their protocols."""
     logs, port, bus_port = tmp_path / "logs", free_udp_port(), free_udp_port()
     unit = f'[raw.unit]\ntransport = "can:udp_multicast:{GROUP}?port={bus_port}"\n'
     rover = f'[gnss.rover]\ntransport = "udp:127.0.0.1:{port}"\nprotocol = "raw"\n'

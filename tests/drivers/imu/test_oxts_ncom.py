@@ -1,4 +1,4 @@
-"""OxTS NCOM, of which no recording was available: a packet by hand, and packets by the encoder."""
+"""Tests OxTS NCOM with a packet written by hand and packets of the encoder, because no recording was available."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def trigger(count: int, millisecond: int = 1500, fine: int = -25, minute: int = 
 
 
 def flight() -> bytes:
-    """Return two seconds at 100 Hz through the end of a minute: the fixture, from which mutations are made."""
+    """Return two seconds at 100 Hz across the end of a minute, which are the fixture that the fuzzer mutates."""
     channels = [
         *(
             modes(),
@@ -93,7 +93,7 @@ def rows_of(records: list[Record], kind: Any) -> Any:
 
 
 def test_a_packet_written_by_hand() -> None:
-    """By the offsets and units of NComRxC.h: time 1234 ms, force and rate, status 4, position, velocity, angles."""
+    """Offsets and units are those of NComRxC.h: time 1234 ms, force, rate, status 4, position, velocity, angles."""
     batch_a = bytes.fromhex("D204 881300 3CF6FF 2483FE E80300 30F8FF B80B00 04")
     batch_b = struct.pack("<2df", 0.829031394, 0.152716309, 500.0)
     batch_b += bytes.fromhex("20A107 102700 E0B1FF A01CE9 204E00 102700")
@@ -137,7 +137,7 @@ def test_the_made_stream_however_cut_and_damaged() -> None:
 
 
 def test_the_makers_decoder_reads_the_same_values_in_the_made_stream() -> None:
-    """Those of fixtures/oxts-ncom/SOURCE.md, by NComRxC."""
+    """The values are NComRxC's, from fixtures/oxts-ncom/SOURCE.md."""
     records, _ = parse(flight())
     samples, solutions = rows_of(records, ImuSamples), rows_of(records, InsSolution)
     for number, time_s, rate in ((59, 1477829459.59, 0.3380451), (198, 1477829460.98, 1.1344564)):

@@ -1,4 +1,4 @@
-"""GSOF reports and POS groups: packets laid out by hand, pages, fixes, INS rows, times, damage."""
+"""Tests GSOF reports and POS groups: packets built by hand, pages, fixes, INS rows, times, damage."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ parse_gsof, parse_pos = partial(parse, GsofParser), partial(parse, PosParser)
 
 
 def rot_l_from_vehicle(roll: float, pitch: float, heading: float) -> Any:
-    """Rotation from forward, right, down to north, east, down, by SciPy's intrinsic z, y', x''."""
+    """Return the rotation from forward, right, down to north, east, down, by SciPy's intrinsic z, y', x''."""
     return Rotation.from_euler("ZYX", [heading, pitch, roll]).as_matrix()
 
 
@@ -94,7 +94,7 @@ def rot_l_from_vehicle(roll: float, pitch: float, heading: float) -> Any:
 
 
 def test_a_report_laid_out_by_hand_is_read() -> None:
-    """Record 1 and 2 of Trimble's OEM receiver help, big-endian, in one page; the sum stands before the last byte."""
+    """Records 1 and 2 of Trimble's OEM receiver help are big-endian, in one page; the checksum precedes the last byte."""
     data = bytes.fromhex("01 0a 12063d80 0926 15 1f 07 01") + b"\x02\x18" + struct.pack(">3d", LAT, LON, 555.0)
     content = b"\x28\x40" + bytes([3 + len(data)]) + b"\x09\0\0" + data
     records, parser = parse_gsof(b"\x02" + content + bytes([sum(content) % 256]) + b"\x03")
@@ -161,7 +161,7 @@ def test_flags_give_the_fix_type(flags1: int, flags2: int, fix_type: FixType, va
 
 
 def test_ins_rows_have_the_attitude_of_the_vehicle_and_sigmas() -> None:
-    """Roll −3.25° lifts the right wing, pitch +2.5° the nose; both checked by SciPy's rotation of the axes."""
+    """Roll of −3.25° lifts the right wing, and pitch of +2.5° the nose; SciPy's rotation of the axes confirms both."""
     for records in (parse_gsof(gsof.encode_report(RECORDS, 1))[0], parse_pos(*GROUPS)[0]):
         (row,) = rows_of(records, InsSolution)
         forward, right, _ = rot_l_from_vehicle(row["roll_rad"], row["pitch_rad"], row["heading_rad"]).T
@@ -206,7 +206,7 @@ def test_impossible_records_are_counted() -> None:
 
 
 def test_a_group_laid_out_by_hand_is_read() -> None:
-    """Group 7 of the POS LV user ICD: 36 bytes behind the length: time and distance, count, status, padding, sum."""
+    """In the POS LV user ICD group 7 has 36 bytes after its length: time, distance, count, status, padding, checksum."""
     body = struct.pack("<4sHHdddBBIBx", b"$GRP", 7, 36, 302_401.0, 55.0, -0.001, 1, 1, 1677, 2)
     words = sum(struct.unpack(f"<{len(body) // 2}H", body)) + 0x2324
     frame = body + struct.pack("<H", -words & 0xFFFF) + b"$#"
@@ -221,7 +221,7 @@ def test_a_group_laid_out_by_hand_is_read() -> None:
 
 
 def test_lengths_are_those_of_a_recording() -> None:
-    """Frames of a POS LV in the tests of clearpathrobotics/applanix_driver (basic_data_smoke.pcap), by group."""
+    """The lengths are of frames of a POS LV in clearpathrobotics/applanix_driver's tests (basic_data_smoke.pcap)."""
     lengths = {1: 140, 2: 88, 7: 44}
     layouts = {1: GROUPS[2], 2: GROUPS[1], 7: GROUPS[3]}
     assert {number: len(frame) for number, frame in layouts.items()} == lengths
