@@ -94,7 +94,7 @@ def rot_l_from_vehicle(roll: float, pitch: float, heading: float) -> Any:
 
 
 def test_a_report_laid_out_by_hand_is_read() -> None:
-    """Records 1 and 2 of Trimble's OEM receiver help are big-endian, in one page; the checksum precedes the last byte."""
+    """Records 1 and 2 of Trimble's OEM receiver help are big-endian, and the checksum precedes the last byte."""
     data = bytes.fromhex("01 0a 12063d80 0926 15 1f 07 01") + b"\x02\x18" + struct.pack(">3d", LAT, LON, 555.0)
     content = b"\x28\x40" + bytes([3 + len(data)]) + b"\x09\0\0" + data
     records, parser = parse_gsof(b"\x02" + content + bytes([sum(content) % 256]) + b"\x03")
@@ -206,7 +206,7 @@ def test_impossible_records_are_counted() -> None:
 
 
 def test_a_group_laid_out_by_hand_is_read() -> None:
-    """In the POS LV user ICD group 7 has 36 bytes after its length: time, distance, count, status, padding, checksum."""
+    """In the POS LV user ICD group 7 has 36 bytes after the length: time, distance, count, status, padding, sum."""
     body = struct.pack("<4sHHdddBBIBx", b"$GRP", 7, 36, 302_401.0, 55.0, -0.001, 1, 1, 1677, 2)
     words = sum(struct.unpack(f"<{len(body) // 2}H", body)) + 0x2324
     frame = body + struct.pack("<H", -words & 0xFFFF) + b"$#"
