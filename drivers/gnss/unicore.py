@@ -152,6 +152,8 @@ class UnicoreParser(StreamParser):
             if frame.kind == NMEA.name and self._nmea is not None:
                 records += self._nmea.add(frame)
             elif frame.kind in (UNICORE.name, NOVATEL_ASCII.name):
+                if self._nmea is not None:
+                    self._nmea.own_frame()
                 try:
                     records += self._log(frame)
                 except text.FieldError as error:

@@ -16,7 +16,7 @@ class NmeaFixes:
 
     The rule uses the order of messages only: as long as no position has come in the own protocol, the first fix waits
     for the second one; later, sentences count again where `FORGET_AFTER_SENTENCES` of them have come since the latest
-    own position.
+    own position. A stream without a frame of the own protocol is one of NMEA: its sentences are left to that parser.
 
     Args:
         settings: of the receiver.
@@ -31,6 +31,11 @@ class NmeaFixes:
         self._sentences_since: int | None = None  # since the latest own position; None: there was none
         self._first: GnssFix | None = None
         self._used = False
+        self._has_own = False  # whether a frame of the own protocol has come
+
+    def own_frame(self) -> None:
+        """Note a frame of the receiver's own protocol."""
+        self._has_own = True
 
     def own_position(self) -> None:
         """Note a position in the receiver's own protocol."""
@@ -41,6 +46,8 @@ class NmeaFixes:
 
     def add(self, frame: Frame) -> list[GnssFix]:
         """Take a sentence; return the fixes that it completed, if they are used."""
+        if not self._has_own:
+            return []
         if self._sentences_since is not None:
             self._sentences_since += frame.data[3:6] in _POSITIONS
             if self._sentences_since < FORGET_AFTER_SENTENCES:

@@ -190,6 +190,8 @@ class UbxParser(StreamParser):
         for frame in frames:
             if frame.kind == "nmea" and self._nmea is not None:
                 items += self._nmea.add(frame)
+            elif frame.kind == "ubx" and self._nmea is not None:
+                self._nmea.own_frame()
             decoder = self._decoders.get(frame.data[2:4])
             if decoder is None or frame.kind != "ubx":
                 continue

@@ -279,12 +279,17 @@ class TestOtherProtocols:
             ("ubx", "sbf/pygpsdata_x5status.log.gz", "sbf"),
             ("sbf", "nmea/polarx2.log.gz", "nmea"),
             ("sbf", "ubx/ublox-zed-f9p-hp.log.gz", "ubx"),
+            ("ubx", "nmea/nmea-rtk.log.gz", "nmea"),
+            ("novatel", "unicore/um982_n4.bin", "unicore"),
+            ("nmea", "gsof/bx992.bin", "gsof"),
+            ("ubx", "applanix/pos_lv.bin", "applanix-pos"),
         ],
     )
     def test_a_real_recording_of_another_receiver_is_named(
         self, configured: str, recording: str, answers_as: str, tmp_path: Path
     ) -> None:
-        data = gzip.decompress((ROOT / "fixtures" / recording).read_bytes())
+        content = (ROOT / "fixtures" / recording).read_bytes()
+        data = gzip.decompress(content) if recording.endswith(".gz") else content
         with pty(lambda number: data[number * 2000 % len(data) :][:2000]) as path:
             report = check(gnss(path, configured), tmp_path)["gnss/rover"]
         assert report.problems == [f"sends {answers_as}, but {configured} is configured"]

@@ -150,7 +150,7 @@ def test_times_count_in_fine_gps_time_only() -> None:
 def test_nmea_gives_the_fixes_where_no_bestnav_comes() -> None:
     gga = [nmea.encode_gga(second * S, 0.8, 0.1, 500.0, 48.0, quality=4) for second in (1, 2)]
     heading = encode_ascii("UNIHEADING", (HEADING,), WEEK, MS)
-    records, _ = parse(gga[0], heading, gga[1])
+    records, _ = parse(heading, *gga)
     assert [type(record) for record in records if not isinstance(record, TimeMessage)] == [
         GnssHeading,
         GnssFix,

@@ -115,3 +115,13 @@ def test_a_broken_heading_is_a_bad_message() -> None:
     for body in ("GNTHS,34x,A", "GNHPR,250000.00,1.0,0.0,0.0,4,9,0.0,0", "PASHR,120000.00,nan,T,,,,,,,1,1"):
         headings, parser = parse(nmea.encode_sentence(body))
         assert (headings, parser.counters.bad_messages) == ([], 1)
+
+
+def test_the_encoded_fixture_is_what_the_encoders_write() -> None:
+    made = b""
+    for second in range(4):
+        at = second * S
+        made += nmea.encode_pashr(at, RAD(-1.25), RAD(2.5), RAD(271.5), (RAD(0.02), RAD(0.03), RAD(0.051)))
+        made += nmea.encode_avr(at, RAD(149.4688), RAD(0.0134), 1.8) + nmea.encode_ths(1.0, mode="AEV"[second % 3])
+    assert (FIXTURES / "nmea/encoded_headings.nmea").read_bytes() == made
+    assert len(parse(made)[0]) == 8

@@ -130,6 +130,7 @@ def test_every_log_is_encoded_and_read_back_as_in_binary() -> None:
         assert ours.events or ours.rows or name == "INSCONFIG"
         assert (one.counters.messages, one.counters.bad_messages) == (other.counters.messages, 0)
         assert one.counters.bytes_skipped == 0
+    assert (FIXTURES / "encoded_both_forms.asc").read_bytes() == stream
     check_random_reads(make, stream)
     check_bytewise(make, stream)
 

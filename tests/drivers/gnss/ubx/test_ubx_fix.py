@@ -21,7 +21,17 @@ from swath.drivers.gnss.ubx.fix import geodetic_from_ecef
 from swath.drivers.gnss.ubx.parser import UbxParser
 from swath.drivers.imu.ubx_esf import make_imu_parser
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
-from swath.georef.records import DeviceStatus, FixType, GnssFix, GnssHeading, ImuSamples, InsSolution, Record, TimeScale
+from swath.georef.records import (
+    DeviceStatus,
+    FixType,
+    GnssFix,
+    GnssHeading,
+    ImuSamples,
+    InsSolution,
+    Record,
+    TimeMessage,
+    TimeScale,
+)
 from tests.drivers.builders import of_type, rows_of, times
 from tests.drivers.gnss.builders import fixes
 from tests.drivers.harness import check_bytewise, check_random_reads, feed_pieces
@@ -288,6 +298,34 @@ def test_the_imu_parser_returns_inertial_records_only() -> None:
     assert {type(record) for record in records} == {InsSolution, ImuSamples}
 
 
+def encoded() -> bytes:
+    """Two seconds of messages of which no recording was available: attitude, sensors and a moving base."""
+    zeros = ubx.NavPvat(*[0] * len(ubx.NavPvat._fields))
+    pvat = zeros._replace(
+        itow_ms=TOW_MS, year=2024, month=11, day=27, hour=11, minute=59, second=42, valid=7, flags=0xB9
+    )
+    pvat = pvat._replace(fix_type=4, satellites=21, lat_1e7_deg=470_000_000, lon_1e7_deg=85_000_000)
+    frames = (
+        *(ubx.NAV_TIMEGPS.encode(TIME), ubx.NAV_POSLLH.encode(POSLLH), ubx.NAV_VELNED.encode(VELNED)),
+        *(ubx.NAV_STATUS.encode(STATUS), ubx.NAV_ATT.encode(ATT), ubx.NAV_PVAT.encode(pvat), relposned(0x137)),
+        *(sensors.encode_esf_meas(1000, FORCE, RATE, 31.75), sensors.encode_esf_raw([(5, FORCE, RATE)], 31.75)),
+        *(
+            sensors.encode_esf_ins(ubx.EsfIns(0x3F00, TOW_MS, 1000, 2000, 3000, -981, 5, 6)),
+            ubx.NAV_EOE.encode(ubx.NavEoe(TOW_MS)),
+        ),
+    )
+    return b"".join(frames) * 2
+
+
+def test_the_encoded_fixture_is_what_the_encoder_writes_and_cuts_change_nothing() -> None:
+    data = (FIXTURES / "ubx/encoded.ubx").read_bytes()
+    assert data == encoded()
+    kinds = {type(record) for record in parse(data)[0]}
+    assert kinds == {TimeMessage, GnssFix, GnssHeading, InsSolution, ImuSamples, DeviceStatus}
+    check_random_reads(lambda: UbxParser(SETTINGS), data)
+    check_bytewise(lambda: UbxParser(SETTINGS), data)
+
+
 # --- NMEA in the stream ---
 
 
@@ -322,7 +360,8 @@ def test_nmea_gives_no_fix_where_ubx_gives_positions() -> None:
     records, parser = parse(*both, nmea.encode_sentence("GPGGA,120000.00,9100.0,N,00830.0,E,1,08,1.0,4.0,M,47.0,M,,"))
     assert messages_of(records) == ["NAV-PVT"] * 4
     assert parser.counters.bad_messages == 0
-    assert messages_of(parse(gga(1))[0]) == ["GGA"]  # alone: known at the end
+    assert messages_of(parse(RAWX, gga(1))[0]) == ["GGA"]  # alone: known at the end
+    assert messages_of(parse(gga(1), gga(2))[0]) == []  # without any frame in UBX, it is a stream of NMEA
 
 
 def test_nmea_counts_again_long_after_the_last_ubx_position() -> None:
