@@ -227,7 +227,7 @@ def scanner_batches(flight: VirtualFlight) -> Iterator[ChunkBatch]:
 
 def pulse_times(flight: VirtualFlight, rows: StructArray, clock: StructArray) -> FloatArray:
     """Return the times of pulses in seconds since the plan's start, by the clock in the packets."""
-    if (clock["pps_time_ns"] < 0).all():  # disciplined: UTC past the hour, or GPS itself
+    if (clock["pps_time_ns"] < 0).all():  # a disciplined head counts UTC past the hour, or GPS time
         return disciplined_times(flight, rows)
     host_s = (clock["host_time_ns"] - flight.host_clock.host_ns(0.0)) * 1e-9
     latched = clock["pps_time_ns"] >= 0

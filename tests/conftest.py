@@ -20,8 +20,8 @@ def prepare_processes() -> None:
     if str(LEAN) not in paths:
         os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(LEAN), *paths]))
     loaded: dict[str, Any] = sys.modules
-    loaded.setdefault("asammdf", None)  # this process has begun: its path is settled
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as many workers as processors: threads would wait in turn
+    loaded.setdefault("asammdf", None)  # the path of this running process cannot change
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # each processor has a worker, so threads would wait
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # else each reads all modules as text
     sys.dont_write_bytecode = False
 

@@ -22,7 +22,7 @@ LONGEST_SUBJECT = 72
 SINCE = "2026-11-27T06:00+00:00"
 NOUN_MAY_BEGIN = {"property", "cached_property", "setter"}
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
-STATEMENTS = (ast.stmt, ast.excepthandler, ast.match_case)  # expressions, most of a file, hold no definition
+STATEMENTS = (ast.stmt, ast.excepthandler, ast.match_case)  # expressions, which are most of a file, hold no definitions
 VERBS = set(
     """
     abandon accept accumulate act add adjust adopt advance allocate answer append apply ask assert begin bind boot

@@ -29,7 +29,7 @@ from mcap.reader import make_reader
 from tests.daemon.rig import free_udp_port
 
 ROOT = Path(__file__).resolve().parents[1]
-# the preset `bench`, flown with a second antenna, by which a straight flight can be navigated, and a second head
+# the preset `bench` with a second antenna, which a straight flight needs for navigation, and a second head
 TWO_HEADS = """
 [gnss.rover]
 secondary_lever_arm_m = [0.1, 1.15, -1.2]
@@ -117,7 +117,7 @@ def content(path: Path) -> bytes:
     if path.suffix == ".json":
         return without_version(data)
     if path.suffix == ".toml":
-        return re.sub(rb"(?m)^(created|id) = .*$", b"", data)  # both hold the time of day
+        return re.sub(rb"(?m)^(created|id) = .*$", b"", data)  # both contain the time of day
     if path.suffix == ".pdf":
         return b""  # the page beside it has the same numbers
     return data

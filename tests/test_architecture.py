@@ -52,7 +52,7 @@ IMPORTED_LATE = {
         "swath.daemon.processing.pages.pdf",
         "swath.daemon.processing.trajectory.page",
     },
-    "swath.daemon.simulate.plans": {"swath.sim"},  # the one door to the virtual aircraft
+    "swath.daemon.simulate.plans": {"swath.sim"},  # the only import of the virtual aircraft
     "swath.daemon.system": {"psutil"},
     "swath.drivers.imu.dbc.signals": {"cantools.database"},
     "swath.drivers.scanner.rows.filler": {"swath.drivers.scanner.rows.compiled"},  # numba
@@ -148,7 +148,7 @@ def test_no_file_contains_a_path_of_a_users_computer() -> None:
     place = re.compile(rb"(?<![\w.$}/~-])/(?:root|work|home|Users)/[\w.-]+")
     for path in tracked():
         if "fixtures" in path.relative_to(ROOT).parts:
-            continue  # recordings and their sources say what they say
+            continue  # recordings and their sources are quoted as they are
         found = place.search(path.read_bytes())
         assert found is None, f"{path.relative_to(ROOT)}: {found.group().decode() if found else ''}"
 

@@ -58,7 +58,7 @@ def test_the_demonstration_passes_and_shows_its_results(played: tuple[str, Path]
     assert "demonstration passed" in text
     assert text.count("every unit is accounted for") == 2
     assert text.count(" same ") == 5 + 4
-    assert text.count("LOCKED") == 4  # receiver and pulse, of both
+    assert text.count("LOCKED") == 4  # receiver and pulse in both parts
     for part, sources in SOURCES.items():
         content = read_log(folder / part / "logs")
         assert all(content.units[source] for source in sources)

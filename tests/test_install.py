@@ -237,7 +237,7 @@ def test_a_folder_with_other_files_is_not_overwritten(tmp_path: Path) -> None:
     assert files_below(tmp_path) == set()
 
 
-# A Python that makes a program of a script and a file, at once; $1 to $3 are -m venv FOLDER.
+# A Python that creates a program from a script and a file at once; $1 to $3 are -m venv FOLDER.
 PYTHON_OF_SCRIPTS = """#!/bin/sh
 [ "$1 $2" = "-m venv" ] || exit 0
 {venv}

@@ -129,7 +129,7 @@ def run_doctor(folder: Path) -> None:
 
 
 def run_offload(folder: Path) -> None:
-    with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="swath-") as usb:  # another disk, and nothing to mount
+    with tempfile.TemporaryDirectory(dir="/dev/shm", prefix="swath-") as usb:  # another disk that need not be mounted
         said = swath("offload", record_a_little(folder), usb)
         assert "safe to delete: 1 log" in said
         assert Path(usb, "SHA256SUMS").exists()
@@ -150,7 +150,7 @@ def point_to_the_page(_: Path) -> None:
 def run_points(folder: Path) -> None:
     """Fly into a log, and make points of it and the page that shows them."""
     swath("sim", "fly", "small", "--seconds", "24", "-o", folder / "small")
-    calibration = folder / "small/left.true.toml"  # its log has the nominal one
+    calibration = folder / "small/left.true.toml"  # the log contains the nominal calibration
     crs = ("--crs", "EPSG:32632")
     said = swath("georef", folder / "small", "-o", folder / "points", *crs, "--calibration", calibration)
     assert "complete: " in said

@@ -67,7 +67,7 @@ def told(digest: Any, record: Any) -> None:
         if not isinstance(value, np.ndarray):
             digest.update(repr(value).encode())
             continue
-        for name in value.dtype.names or [...]:  # between columns of a row lies what was there before
+        for name in value.dtype.names or [...]:  # the bytes between columns of a row are undefined
             digest.update(value[name].tobytes())
 
 

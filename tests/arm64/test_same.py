@@ -26,10 +26,10 @@ FLOWN_S = "24"
 HANGS_S = 3000.0
 DATA_LOST = 4
 
-MAP_M = 1e-9  # the last place of a northing of 5 259 km, and of the earth's radius, from which PROJ takes heights
+MAP_M = 1e-9  # the last digit of a northing of 5 259 km, and of the earth's radius in PROJ's heights
 FINE_SCALE_M = 1e-6
 EARTH_M = 6.4e6
-OF_A_SIGMA = 1e-5  # what rounding may amount to in a filter and smoother of thousands of epochs
+OF_A_SIGMA = 1e-5  # allows for rounding in a filter and smoother of thousands of epochs
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from swath.georef.trajectory.trajectory import Trajectory
 Surface = Callable[[FloatArray, FloatArray], FloatArray]
 
 BETWEEN_NS = 1_000_000_000_000
-STEPS = 28  # of the march
+STEPS = 28  # of the search along the beam
 START_NS = 1_400_000_000_000_000_000
 T_FROM_NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # t from north, east, down
 

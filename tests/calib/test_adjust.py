@@ -223,7 +223,7 @@ def test_a_wrong_sighting_is_removed() -> None:
     assert set(residuals.feature[taken]) == {3}
     assert set(residuals.swath[taken]) == {first.swath}
     (of_ties,) = (one for one in found.groups if one.group == "ties")
-    assert (of_ties.observations, of_ties.rejected) == (len(residuals.weight), len(taken))  # rejected of all
+    assert (of_ties.observations, of_ties.rejected) == (len(residuals.weight), len(taken))  # all, and the rejected
     assert (np.abs(found.values - good.values) < 0.5 * good.sigmas).all()
 
 

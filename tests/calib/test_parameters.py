@@ -124,7 +124,7 @@ def test_tables_start_from_the_existing_ones_and_are_returned() -> None:
     assert RangeOffset(by_name["top.range_offset_zone.3"], None, 3) in done.range_offsets
     assert len(done.range_offsets) == 3
     assert done.beams[2] == BeamCorrection(by_name["top.beam.2.azimuth_rad"], 0.02, by_name["top.beam.2.range_m"])
-    assert "top.beam.0.range_m" not in asked.names  # the first beam is what others are told from
+    assert "top.beam.0.range_m" not in asked.names  # the other beams are relative to the first
     assert done.value("phi_rad") == by_name["top.phi_rad"]
 
 

@@ -106,7 +106,7 @@ def test_a_roof_is_one_face_of_the_scene_and_has_its_direction(cast: Cast, found
     assert len(roofs) > 20
     angles, offsets = [], []
     for plane, face, share in roofs:
-        assert share > 0.99, plane.name  # nothing from beyond the ridge, which would make every roof lower
+        assert share > 0.99, plane.name  # returns from beyond the ridge would lower every roof
         assert made_of(cast, plane)[ROOF] > 0.97 * plane.points, plane.name
         true = cast.planes[face]
         angles.append(np.degrees(np.arccos(min(1.0, float(plane.normal_t @ true[:3])))))
@@ -150,7 +150,7 @@ def test_two_neighbouring_roofs_with_equal_slope_are_two_planes(cast: Cast, foun
         for other in faces
         if one < other and cast.planes[one, :3] @ cast.planes[other, :3] > 0.9999
     ]
-    assert alike  # both are there, and `true_face` says that no plane is of both
+    assert alike  # both faces were found, and by `true_face` no plane mixes them
 
 
 def test_trees_water_walls_and_cars_give_no_planes(cast: Cast, found: Features) -> None:

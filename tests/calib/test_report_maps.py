@@ -138,7 +138,7 @@ def test_a_grid_in_t_is_turned_onto_the_map(report: ReportInput) -> None:
     share = [[0.5, 200.0 / (grid.before_m.shape[0] * grid.cell_m)]]
     place = axes.transData.inverted().transform(image.get_transform().transform(share))[0]
     middle = Transformer.from_crs("EPSG:4978", "EPSG:32632", always_xy=True).transform(*report.flight.frame.origin_e)
-    assert place == pytest.approx(middle[:2], abs=0.5)  # t lies level at the ground's height, below its origin
+    assert place == pytest.approx(middle[:2], abs=0.5)  # t's plane is level, at the height of the ground
 
 
 def test_the_colour_of_a_plane_is_the_class_of_its_mean(report: ReportInput) -> None:

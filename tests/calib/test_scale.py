@@ -38,7 +38,7 @@ def test_spacing_of_a_diagonal_swath_is_not_that_of_its_bounding_box() -> None:
     """The strip is 10 m wide and runs 2 km to the north-east."""
     along, across = np.random.default_rng(4).uniform([0.0, 0.0], [2000.0, 10.0], (40_000, 2)).T
     points = np.stack([along - across, along + across, 0.0 * along], axis=1) / np.sqrt(2.0)
-    assert spacing_m(swath_of(points)) == pytest.approx(np.sqrt(2000.0 * 10.0 / 40_000), rel=0.2)  # its box: 70 times
+    assert spacing_m(swath_of(points)) == pytest.approx(np.sqrt(2000.0 * 10.0 / 40_000), rel=0.2)  # its box gives 70×
 
 
 def test_a_swath_without_points_has_no_spacing() -> None:

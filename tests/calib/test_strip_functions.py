@@ -95,7 +95,7 @@ def test_a_shift_and_a_drift_are_found_in_their_strips(clean: tuple[Flight, Feat
         found = np.concatenate([result.fit.position_l, result.fit.attitude_rad], axis=1)[mine]
         sigma = np.concatenate([result.fit.position_sigma_l, result.fit.attitude_sigma_rad], axis=1)[mine]
         wanted = np.tile(truth, (len(found), 1)) if strip == 3 else truth[:, np.newaxis] * [0, 0, 0, 1, 0, 0]
-        if strip == 3:  # its course is north: the returns show only the sum of this shift and a turn about east
+        if strip == 3:  # on a course of north returns show only the sum of this shift and a turn about east
             wanted[:, 4] = wanted[:, 0] / HEIGHT_M
         assert (np.abs(found - wanted) < 3.5 * sigma).all()
         assert (sigma[:, 2] < 0.02).all()
@@ -297,7 +297,7 @@ def test_sigmas_contain_the_errors_of_the_held_calibration(clean: tuple[Flight, 
     with_it: dict[int, list[float]] = {component: [] for component in range(6)}
     without_it: list[float] = []
     for run in range(30):
-        true = PRIORS * rng.standard_normal(6) * [0, 1, 1, 1, 0, 1]  # along and pitch: the returns show their sum
+        true = PRIORS * rng.standard_normal(6) * [0, 1, 1, 1, 0, 1]  # returns show only the sum of along and pitch
         bad = spoilt(noised(flight, 900 + run), 3, np.tile(turned(true, courses[2]), (2, 1)))
         error = rng.multivariate_normal(np.zeros(len(INDEX)), told.covariance())
         held = {start.scanner: replace(told, parameters=told.parameters + error)}

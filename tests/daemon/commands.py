@@ -71,7 +71,7 @@ class Starter:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            start_new_session=True,  # so that it can be ended together with a command that hangs
+            start_new_session=True,  # the whole group can be ended if a command hangs
         )
 
     def run(self, arguments: list[str], environment: dict[str, str]) -> subprocess.CompletedProcess[str]:

@@ -33,7 +33,7 @@ class Receiver:
         self.main, secondary = os.openpty()
         tty.setraw(secondary)
         self.path = os.ttyname(secondary)
-        self._secondary = secondary  # kept, so that the line stays when nobody has it open
+        self._secondary = secondary  # kept open, so that the line survives when no one else has it open
         os.set_blocking(self.main, False)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-HANGS_S = 900.0  # measures nothing: it ends what would never end, below what pytest allows a test
+HANGS_S = 900.0  # a limit for what would never end, shorter than pytest's for a test
 
 
 def free_udp_port() -> int:

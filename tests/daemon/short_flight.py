@@ -28,7 +28,7 @@ from swath.sim.gnss.novatel import NovatelMessages
 from swath.sim.plan.plan import parse_plan
 
 MARK_AFTER_NS = 123_456_789  # of each whole second
-CLOCK_OFFSET_S = 2.5e-7  # of the receiver, in what its marks say
+CLOCK_OFFSET_S = 2.5e-7  # error of the receiver's clock, as its marks state it
 CLOCK_SIGMA_S = 1e-4
 S = 1_000_000_000
 POS_HEAD = """% program   : RTKLIB

@@ -23,8 +23,8 @@ WEEK, MONDAY_S = 2423, 86_400 + 9 * 3600 + 18  # 2026-06-15T09:00:00Z in GPS tim
 START_NS = 1_781_514_000 * 1_000_000_000  # the same as Unix time
 PPM, OFFSET_NS = -12.0, 20_000_000
 SOURCES = ("gnss/rover", "imu/main", "pps/main", "scanner/left", "scanner/left/aux")
-LATE_S = 3e-5  # of a stamp
-TICKS = 10_000_000  # of the scanner's counter, a second
+LATE_S = 3e-5  # delay of a stamp
+TICKS = 10_000_000  # of the scanner's counter per second
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ def test_frames_arrive_in_order_with_kernel_timestamps(vcan: str) -> None:
     assert got == sent
     assert len(stamps) == len(sent)
     assert [before_ns, *stamps, after_ns] == sorted([before_ns, *stamps, after_ns])
-    assert frames(sender) == []  # what is sent does not come back
+    assert frames(sender) == []  # a sender does not receive its own frames
     sender.close()
     receiver.close()
 
@@ -152,7 +152,7 @@ def test_controllers_with_a_bit_rate_exchange_frames() -> None:
     sent = [encode_can_frame(0x18FF0000 | n, n.to_bytes(8, "big"), extended=True) for n in range(100)]
     for frame in sent:
         sender.send(frame)
-        time.sleep(0.005)  # the emulated controller overruns otherwise, and says so in error frames
+        time.sleep(0.005)  # otherwise the emulated controller overruns and sends error frames
     assert frames(receiver) == sent
     sender.close()
     receiver.close()

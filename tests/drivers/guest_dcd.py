@@ -44,7 +44,7 @@ def test_both_edges_and_the_data_of_one_port_are_received() -> None:
 def test_close_ends_a_wait_and_the_port_can_be_opened_again() -> None:
     source = SerialDcdPps(PORT)
     source.open()
-    while source.receive(0.3):  # until it is between two edges
+    while source.receive(0.3):  # read until no edge comes for 0.3 s
         pass
     got: list[list[RawEdge]] = []
     thread = threading.Thread(target=lambda: got.append(source.receive(60.0)))

@@ -33,14 +33,14 @@ from swath.georef.records import Chunk, ChunkBatch, DeviceClockSamples, ImuSampl
 
 Factory = Callable[[], Parser]
 SOURCE = "gnss/test"
-STREAM_HOST_NS = 1_000_000_000  # one host time for all reads, so that it cannot tell cuts apart
+STREAM_HOST_NS = 1_000_000_000  # the same for all reads, so that times cannot reveal the cuts
 ARRAY_RECORDS = (ImuSamples, InsSolution, ScannerReturns, DeviceClockSamples)
 COUNTER_FIELDS = dataclasses.fields(ParserCounters)
 
 CUT_WINDOW_BYTES = 8 * 1024
 BYTEWISE_BYTES = 64 * 1024
-CUT_TAIL_BYTES = 1200  # fed behind a cut: longer than nearly all messages; what is held back then comes out at close
-CUT_TAIL_MESSAGES = 3  # or so many message ends, where they are known: that of the message cut and two more
+CUT_TAIL_BYTES = 1200  # fed after a cut; longer than nearly all messages, and the rest comes when the parser is closed
+CUT_TAIL_MESSAGES = 3  # or so many messages, if their ends are known: the one cut and two more
 CHECKPOINT_BYTES = 128
 RANDOM_CUTS = 500
 
@@ -438,7 +438,7 @@ def check_packets(make: Factory, units: Sequence[bytes], seeds: Sequence[int] = 
 
 def check_packet_damage(make: Factory, units: Sequence[bytes], *, examples: int = 60) -> None:
     """Check that units cut short, extended or flipped never raise, in any batches, and every byte is counted."""
-    few, fresh = list(units[:40]), Snapshot(make()).again  # to make one may take reading a DBC file
+    few, fresh = list(units[:40]), Snapshot(make()).again  # a new parser may need to read a DBC file
 
     @settings(max_examples=examples, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
     @given(

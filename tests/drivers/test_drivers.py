@@ -62,7 +62,7 @@ def test_every_driver_declares_its_identity(driver: Driver) -> None:
 def test_every_scanner_declares_its_beam_geometry(driver: Driver) -> None:
     parsers = []
     for found in settings_of(driver):
-        with suppress(DriverSettingsError):  # a file of the fixtures that is another head's
+        with suppress(DriverSettingsError):  # the fixture's file belongs to another head
             parsers.append(driver.make_parser(found))
     assert parsers
     for parser in parsers:

@@ -250,7 +250,7 @@ def check_ouster(copy: Path, entry: Entry) -> None:
     ours = (head.model, str(head.serial), head.imu_profile, head.beams, head.columns_per_frame, head.columns_per_packet)
     theirs = ("prod", "sn", "imu_profile", "pixels", "columns_per_frame", "columns_per_packet")
     assert ours == tuple(sensor[key] for key in theirs)
-    if sensor["profile"] != "OFF":  # as its library calls that of a head that is told to send no lidar packets
+    if sensor["profile"] != "OFF":  # the library's name for a head that sends no lidar packets
         assert head.profile == sensor["profile"]
     settings = DeviceSettings("scanner/left", {}, {"geometry": metadata})
     parser = find_driver("scanner", "ouster").make_parser(settings)

@@ -64,7 +64,7 @@ def _targets(*, guided: bool) -> dict[str, Callable[[], Target]]:
         with atheris.instrument_imports(include=["swath"]):
             from tests.fuzz.targets import all_targets
 
-            return all_targets()  # imports the drivers
+            return all_targets()  # this imports the drivers
     from tests.fuzz.targets import all_targets
 
     return all_targets()

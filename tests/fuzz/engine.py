@@ -23,8 +23,8 @@ from hypothesis import strategies as st
 
 SECONDS_OF_AN_INPUT = 5.0  # of processor time, for at most `mutation.LARGEST_CASE_BYTES`
 MUTATIONS_OF_A_PATH = 10
-FROM_SEED = 0.5  # of mutations begin at the seed again, the others go on from the mutation before
-MEASURED_OF_PATHS = 64  # one path in so many has its memory measured, which makes it several times slower
+FROM_SEED = 0.5  # share of mutations that begin at the seed again; the others continue from the previous one
+MEASURED_OF_PATHS = 64  # one path in so many measures its memory, which makes it several times slower
 INPUTS_OF_A_LIFE = 300
 PATHS_OF_A_ROUND = 100  # between two looks at the clock
 SETTINGS = settings(

@@ -94,7 +94,7 @@ def _imports(target: str, place: Place) -> Target:
 
     def run(data: bytes) -> Iterator[str]:
         files = _exported() | {name: gzip.compress(data, 1, mtime=0) if packed else data}
-        if target == "export-tags":  # a sidecar would say more than tags do
+        if target == "export-tags":  # the sidecar would replace the tags
             files.pop(TAGGED + SUFFIX, None)
         with tempfile.TemporaryDirectory(prefix="swath-fuzz-") as folder:
             for one, content in files.items():

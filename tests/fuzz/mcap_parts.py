@@ -63,7 +63,7 @@ class Piece:
     opcode: int
     body: bytes
     inner: list[Piece] | None = None
-    claimed: int | None = None  # the size a chunk says it has, where not the right one
+    claimed: int | None = None  # the size stated by a chunk, if it is wrong
 
     def encode(self) -> bytes:
         """Encode with its head and a valid CRC."""

@@ -25,7 +25,7 @@ from tests.fuzz.recordings import is_on_can, packets_of, settings_of, streams_of
 SOURCE = "fuzz/fuzz"
 HOST_NS = 1_800_000_000_000_000_000
 EXTREME_TIMES_NS = (0, -1, (1 << 63) - 1, -(1 << 63), 7_258_118_400_000_000_000, 1)
-GROWTH_BYTES = 400 * 1024  # what a parser may gain over hundreds of inputs: names of messages, a frame held back
+GROWTH_BYTES = 400 * 1024  # how much a parser may grow over hundreds of inputs, by names of messages and a held frame
 SEED_BYTES = 8 * 1024
 _UNIT = struct.Struct("<Hq")  # of a case of packets: length of the unit, its host time
 Run = Callable[[Parser, bytes, int], list[Record]]

@@ -38,10 +38,10 @@ def test_a_time_difference_is_described_in_words(ahead: float, kept: bool, said:
     ("ahead", "kept"),
     [
         (0.4, True),
-        (-18.0, True),  # leap seconds that the receiver does not know yet: judged with the second of the edges
+        (-18.0, True),  # leap seconds that the receiver does not yet know, which are judged with the edges' second
         (2220.0, False),
         (-1234.56 * DAY_S, False),
-        (15 * 3600.0, False),  # no time zone is that far
+        (15 * 3600.0, False),  # no time zone is so far from UTC
     ],
 )
 def test_small_differences_and_unset_clocks_give_no_warning(ahead: float, kept: bool) -> None:

@@ -22,7 +22,7 @@ from swath.georef.arrays import BoolArray, FloatArray
 TO_ECEF = Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True)
 TO_GEODETIC = Transformer.from_crs("EPSG:4978", "EPSG:4979", always_xy=True)
 Bending = Callable[[FloatArray, FloatArray], FloatArray]  # heights of sensor and ground, m → Δd / tan α
-PIECE_S = 8.0  # of trajectory at a time: RotationSpline solves for all its knots at once
+PIECE_S = 8.0  # length of a piece, because RotationSpline solves for all its knots at once
 
 
 @dataclass(frozen=True)

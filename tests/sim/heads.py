@@ -73,7 +73,7 @@ def measured_of(pulses: Pulses, farthest_m: float = 120.0) -> Shots:
     alike = pulses.number % 7 == 0
     range_m[alike, 1] = range_m[alike, 0] + 0.0004
     range_m[table[:, SLOTS : 2 * SLOTS] < 0.4] = 0.0
-    light = np.floor(12.0 * table[:, 2 * SLOTS :]) * 20.0  # so coarse that many are equal
+    light = np.floor(12.0 * table[:, 2 * SLOTS :]) * 20.0  # so coarse that many values are equal
     rows = np.zeros((count, SLOTS), RETURN_TRUTH_DTYPE)
     rows["range_m"], rows["pulse"] = range_m, pulses.number[:, np.newaxis]
     rows["channel"] = pulses.channel[:, np.newaxis]

@@ -244,7 +244,7 @@ def test_unusual_beams_stay_finite(refraction: str) -> None:
     bent = air.bend(direction, DOWN, np.full(6, 900.0), np.full(6, 400.0))
     np.testing.assert_array_equal(
         bent[[0, 1, 3, 4]], direction[[0, 1, 3, 4]]
-    )  # down and above the horizon: as they are
+    )  # beams that go down or above the horizon are unchanged
     np.testing.assert_allclose(bent, direction, rtol=0, atol=1e-4)
     below = air.bending(one(0.5), one(300.0), one(400.0))
     np.testing.assert_allclose(below, 0.0, rtol=0, atol=1e-12)

@@ -131,7 +131,7 @@ QUADS = [(0, 1, 5, 4), (1, 2, 6, 5), (2, 3, 7, 6), (3, 0, 4, 7)]
 def houses_at(center_m: tuple[float, float]) -> str:
     """Return the text of a plan with four buildings around a place."""
     x, y = center_m
-    slope = "height_m = 450\nslope_percent = 4\nslope_towards_deg = 20\n"  # so that a corner is the highest ground
+    slope = "height_m = 450\nslope_percent = 4\nslope_towards_deg = 20\n"  # makes a corner the highest ground
     return slope + BUILDINGS.format(x0=x - 15.0, x1=x + 15.0, y0=y - 15.0, y1=y + 15.0)
 
 

@@ -196,7 +196,7 @@ def test_a_device_without_its_edges_reports_it() -> None:
     assert len(counts) == 1  # the edge at the start, none after
     assert locked[0] == 1
     assert locked[-1] == 0
-    assert sum(unit.source == "pps/main" for unit in units) == 5  # the host has them all
+    assert sum(unit.source == "pps/main" for unit in units) == 5  # the host has all edges
 
 
 def test_error_for_an_unknown_pps_names_the_key() -> None:

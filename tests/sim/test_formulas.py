@@ -87,7 +87,7 @@ def test_ground_point_matches_formula_sheet_2_1() -> None:
     np.testing.assert_allclose(height, 536.88193774557, rtol=0, atol=2e-8)
 
 
-# 5.2: Δρ = 0.12 m, s_ρ = 2e-5, Δθ = 0.02°, s_θ = 3e-4, Δη = 0.01°: ρ' and θ' as its model has them
+# Section 5.2: Δρ = 0.12 m, s_ρ = 2e-5, Δθ = 0.02°, s_θ = 3e-4, Δη = 0.01°; ρ' and θ' are the model's
 RANGE_SCALE, ANGLE_SCALE = 1 + 2e-5, 1 + 3e-4
 AT = Shot(
     boresight=radians(0.05, -0.08, 0.03),

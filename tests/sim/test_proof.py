@@ -105,7 +105,7 @@ def pulse_angles(flown: Flown) -> FloatArray:
 @pytest.mark.parametrize("motion", ["sine", "triangle"])
 def test_points_of_an_oscillating_mirror_are_recovered_with_every_error(tmp_path: Path, motion: str) -> None:
     true = dict(EVERY_ERROR)
-    if motion == "triangle":  # at its turning points nobody knows a derivative by the readings alone
+    if motion == "triangle":  # readings alone do not determine a derivative at its turning points
         true |= {"encoder_latency_us": 0.0, "torsion_us2": 0.0}
     scanner = {"motion": motion, "true": true, "installation": TURNED}
     scanner["ibrc"] = {"intensity": [0.0, 500.0, 2000.0, 65535.0], "correction_m": [0.02, 0.01, -0.005, -0.03]}
@@ -137,7 +137,7 @@ def test_points_of_a_polygon_are_recovered_with_facet_tilts(tmp_path: Path) -> N
     assert set(facet.tolist()) == {0, 1, 2, 3}
     assert (missed <= bound(flown, **SREP_24_BIT)).all(), missed.max()
     flat = line_points(flown, theta, line_direction(calibration, theta))
-    assert misses(flown, flat).max() > 0.3  # and the tilts were there: 2 ε cos i at 800 m
+    assert misses(flown, flat).max() > 0.3  # without the tilts points are off: 2 ε cos i at 800 m
 
 
 def mirrored(ray: FloatArray, normal: FloatArray) -> FloatArray:

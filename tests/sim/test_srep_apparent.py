@@ -63,7 +63,7 @@ def test_apparent_ranges_are_assigned_to_their_pulse(prf_hz: float) -> None:
     assert [one[0] for one in found] == ticks
     assert [one[1] for one in found] == pulses["encoder"][at].tolist()
     np.testing.assert_allclose([one[2] for one in found], spoken.truth["range_m"], atol=0.5e-4 + 1e-6)
-    rows, _ = spoken.parsed()  # the parser, which resolves nothing, has them in the same order
+    rows, _ = spoken.parsed()  # the parser leaves ranges ambiguous and keeps the order
     assert len(rows) == len(spoken.truth)
     assert (rows["mta_zone"] == 255).all()
     said = [1e-4 * apparent for _, _, ranges in records_of(spoken.units) for apparent in ranges if apparent]
@@ -78,7 +78,7 @@ def test_of_more_echoes_than_slots_the_latest_are_lost_and_counted() -> None:
     pulses = LineHead(table, "left").pulses(0.0, 6e-6 - 1e-9)
     unambiguous_m = C_MPS / 2e6
     range_m = np.zeros((6, 1))
-    range_m[0] = 2.7 * unambiguous_m  # all three in the record of pulse 2
+    range_m[0] = 2.7 * unambiguous_m  # all three echoes are in the record of pulse 2
     range_m[1] = 1.2 * unambiguous_m
     range_m[2] = 0.5 * unambiguous_m
     range_m[3] = 2.0 * unambiguous_m + 2e-5  # with the emission of pulse 5: no range

@@ -91,7 +91,7 @@ class Recorder:
         except TimeoutError:
             raise AssertionError(f"never READY: {self.words()}") from None
         notify.settimeout(0)
-        self._notify = notify  # what else it says, nobody reads: it does not wait for that
+        self._notify = notify  # nobody reads its further messages, and it does not wait for that
 
     def words(self) -> str:
         """Return its output."""

@@ -40,7 +40,7 @@ packet_counter = "SAMPLE.packet_counter"
 def imu(name: str, channel: str, rate_hz: int, options: str = "") -> str:
     """Return an [imu.<name>] table for an interface."""
     WORK.mkdir(parents=True, exist_ok=True)
-    dbc = shutil.copy(TREE / "fixtures/config/imu.dbc", WORK)  # the project may lie where only root looks
+    dbc = shutil.copy(TREE / "fixtures/config/imu.dbc", WORK)  # the project's folder may be open to root only
     return IMU.format(name=name, channel=channel, rate_hz=rate_hz, dbc=dbc, options=options)
 
 

@@ -86,7 +86,7 @@ def stall() -> None:
         scanner.send(best, 0.5)
         recorder.process.send_signal(signal.SIGSTOP)
         scanner.send(best, STALL_S)
-        for _ in range(2):  # a slow machine's rate may not fill it
+        for _ in range(2):  # a slow machine's rate may not fill the buffer
             scanner.send(16_000, 0.05)
         recorder.process.send_signal(signal.SIGCONT)
         drained()

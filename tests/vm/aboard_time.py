@@ -136,9 +136,9 @@ def edges(module: str) -> None:
         sh(f"insmod {module}")
         lend("/dev/pps0")
         returned = time.monotonic_ns()
-        time.sleep(14.0)  # it is looked for every 5 s at the longest
+        time.sleep(14.0)  # the recorder looks for it every 5 s at most
         end = time.monotonic_ns()
-    offset_ns = time.time_ns() - time.monotonic_ns()  # nobody steps this clock; the pulses are on its seconds
+    offset_ns = time.time_ns() - time.monotonic_ns()  # this clock is never stepped, and pulses are on its whole seconds
     times = {"lost": lost, "back": back, "gone": gone, "returned": returned, "end": end}
     keep("told", {"utc_minus_monotonic_ns": offset_ns, **times})
 

@@ -38,7 +38,7 @@ _WIRES = {
     "scanner/left": "udp:127.0.0.1:2368",
     "pps/main": "/dev/pps0",
 }
-# the log on a disk of its own; devices that need no udev come before systemd asks for them
+# The log has its own disk; devices that need no udev appear before systemd asks for them.
 _FSTAB = "/dev/vda /var/lib/swath ext4 defaults 0 0\n"
 _DEVICES = """\
 [Unit]

@@ -12,7 +12,7 @@ from tests.vm.beside import Moment
 from tests.vm.machine import stood_still
 
 HERE = Path(__file__).resolve().parent
-HANGS_S = 1500.0  # beyond it nothing is awaited; a machine has its own limit
+HANGS_S = 1500.0  # no wait is longer; a machine has its own limit
 _BEGAN = pytest.StashKey[Moment]()
 
 

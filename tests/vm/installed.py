@@ -73,7 +73,7 @@ def _install(layer: Path) -> None:
     for name in _ACCOUNTS:
         if Path("/etc", name).exists():
             shutil.copy(Path("/etc", name), layer / "etc" / name)
-    _run(["systemd-sysusers", f"--root={layer}"], environment)  # a package's script would, or the next start
+    _run(["systemd-sysusers", f"--root={layer}"], environment)  # a package's script would do this, or the next start
     for path in (layer, *(one for one in layer.rglob("*") if one.is_dir() and not one.is_symlink())):
         path.chmod(0o755)
 

@@ -25,12 +25,12 @@ TREE = HERE.parent.parent
 CACHE = HERE / ".cache"
 GUEST = HERE / "guest"
 MODULES = CACHE / "modules"  # pps_sim.ko
-UDEV = CACHE / "udev"  # a layer: the host may have no udev
+UDEV = CACHE / "udev"  # a layer, because the host may have no udev
 DCD_SHIM = CACHE / "dcd_shim.so"
 
 BOOT_S = 120.0  # twenty times what it takes on an idle machine
 FIRST_WORD_S = 60.0  # from power on to VM-STAGE1, likewise
-POWERED_ON = 3  # times at most, where it stands still before that
+POWERED_ON = 3  # times that it is powered on at most, if it stands still before that
 TIMED_OUT = 124
 NO_STATUS = 125
 SERVE = """\
@@ -43,7 +43,7 @@ done
 """  # a command for `start`: what `Machine.shell` asks, one after the other, until the power goes
 stood_still: list[Path] = []  # their folders; told at the end of a run
 _SYSTEMD = "/lib/systemd/systemd"
-# what udev would load for the processor and for what the board has: seconds where the processor is emulated
+# modules that udev would load for processor and board, which takes an emulated processor seconds
 _NOT_LOADED = (
     *("kvm", "kvm_amd", "kvm_intel", "acpi_cpufreq", "powernow_k8", "aesni_intel", "ghash_clmulni_intel"),
     *("crct10dif_pclmul", "crc32_pclmul", "sha512_ssse3", "ccp", "button", "psmouse", "pcspkr", "lpc_ich", "iTCO_wdt"),
@@ -359,7 +359,7 @@ def _prepare(shared: Path, command: str, overlay: Path | None, systemd: bool) ->
         shutil.copy(GUEST / "coldplug.conf", units / "systemd-udev-trigger.service.d")
     for folder in (root, *(path for path in root.rglob("*") if path.is_dir() and not path.is_symlink())):
         if folder.exists():
-            folder.chmod(folder.stat().st_mode | 0o055)  # made in a temporary folder, they would lock users out
+            folder.chmod(folder.stat().st_mode | 0o055)  # folders made in a temporary one would lock users out
 
 
 def _accelerator() -> list[str]:

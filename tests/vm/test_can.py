@@ -72,14 +72,14 @@ def test_can_at_1_khz_is_recorded_without_loss_and_with_kernel_timestamps(tmp_pa
 
 
 def test_can_overruns_are_counted_exactly(tmp_path: Path) -> None:
-    sent = 20_000  # into a buffer for about 2700
+    sent = 20_000  # the buffer has space for about 2700
     aboard(tmp_path, "aboard_can", "overrun", sent, seconds=25)
     content = read_log(tmp_path / "logs")
     numbers = [int.from_bytes(data[8:16], "little") for data in units(content, "imu/main") if data[:2] == b"\0\7"]
     after = [data for data in units(content, "imu/main") if data[:2] == b"\1\7"]
     status = last_status(content, "imu/main")
     assert status["lost_kernel"] > sent // 2, status
-    assert numbers == list(range(len(numbers)))  # the buffer keeps the first
+    assert numbers == list(range(len(numbers)))  # the buffer keeps the first frames
     assert len(after) == 100
     assert sent + 100 == status["written"] + status["lost_kernel"] == status["units"], status
     assert len(numbers) + status["lost_kernel"] == sent
@@ -130,7 +130,7 @@ def test_two_can_controllers_are_recorded_at_200_hz(tmp_path: Path) -> None:
     both = frames_of(range(2 * count), 5000)
     later = frames_of(range(2 * count, 2 * count + 200), 5000)
     for source in ("imu/left", "imu/right"):
-        data = [frame for frame in units(content, source) if not frame[3] & 0x20]  # a controller may tell of its state
+        data = [frame for frame in units(content, source) if not frame[3] & 0x20]  # a controller may report its state
         assert data == both + later, (source, len(data))
         assert_nothing_lost(content, source)
     assert len(content.events("device_lost")) == 1

@@ -37,7 +37,7 @@ from tests.daemon.rig import HANGS_S, wait_until
 from tests.vm import aircraft, machine
 from tests.vm.installed import with_udev
 
-PRF_HZ = 2000  # what an emulated machine can follow; 1000 on the other flight of this kind of the ordinary tests
+PRF_HZ = 2000  # an emulated machine can follow this rate; the other flights of this kind have 1000
 SECONDS, SECONDS_LONG = 60.0, 180.0
 BITRATE = 460_800
 SO_RCVBUFFORCE = 33  # <asm-generic/socket.h>; the tests here run as root
@@ -95,7 +95,7 @@ class Lines:
         self._clock.settimeout(0.2)
         self.clock_port = int(self._clock.getsockname()[1])
         self._bus = can.Bus(CAN_GROUP, interface="udp_multicast", port=can_port)
-        with socket.socket(fileno=os.dup(self._bus.fileno())) as wire:  # a busy computer comes late to it
+        with socket.socket(fileno=os.dup(self._bus.fileno())) as wire:  # a busy computer reads it late
             wire.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, 16 << 20)
         self._stream_port = stream_port
         self.frames = 0
@@ -248,7 +248,7 @@ def test_a_flight_is_recorded_from_the_wires_and_georeferenced(
     record_property("points", len(las))
     # returns before the first or after the last sample of the IMU have no pose
     assert len(las) > 0.99 * len(truth["left.gps_ns"])
-    assert len(las) > PRF_HZ * seconds / 3  # the turn of three minutes lies beyond the ground
+    assert len(las) > PRF_HZ * seconds / 3  # the turn of the three-minute flight is beyond the ground
     time_ns = np.rint(np.asarray(las.gps_time) * 1e9).astype(np.int64) + 10**18
     sigma = np.stack([np.asarray(las[f"sigma_{name}"]) for name in ("easting", "northing", "height")], axis=1)
     recorded = Recorded(logs, np.empty(0, POINT_DTYPE), truth)

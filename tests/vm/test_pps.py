@@ -38,7 +38,7 @@ def test_pps_seconds_are_never_wrong_whatever_happens_to_the_edges(tmp_path: Pat
 
 
 KINDS = ("ldisc", "dcd")
-RECORDED_S = 45.0  # uneven edges that do not stand still for five seconds get their second after 24 of them
+RECORDED_S = 45.0  # uneven edges, which never agree for five seconds, get their second after 24 edges
 
 
 @contextmanager

@@ -31,7 +31,7 @@ def test_a_stall_of_half_a_second_loses_no_data_or_is_counted_with_a_small_buffe
     assert status["lost_kernel"] == installed["drops"]
     assert status["units"] == installed["sent"]
     got = numbers(content)
-    first = installed["sent"] - 2 * told["in_stall"]  # what was sent in the stall, and as much after it
+    first = installed["sent"] - 2 * told["in_stall"]  # the units of the stall, and as many after it
     assert got[got.index(first) :] == list(range(first, installed["sent"]))
 
     content = read_log(tmp_path / "default")

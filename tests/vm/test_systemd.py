@@ -30,7 +30,7 @@ USB = [
     *("-device", "usb-serial,chardev=ftdi,serial=FT4XYZ12,always-plugged=on"),
 ]
 
-# the sandbox of a unit around another program, which must not be taken for the service
+# The sandbox runs another program here, which must not be mistaken for the service.
 _OTHERWISE = {
     "Type": "oneshot",
     "Restart": "no",
@@ -154,7 +154,7 @@ def test_devices_have_their_names_and_rights(service: Machine) -> None:
 def test_a_rule_makes_a_pps_source_of_a_serial_port(service: Machine) -> None:
     """The unit holds the line discipline while the recorder has the same port open."""
     service.until("systemctl is-active swath-pps@ttyS1 && ls /dev/pps1")
-    service.told("sleep 5")  # what a rule itself starts does not live so long
+    service.told("sleep 5")  # a process started by the rule itself would have ended
     assert service.told("stat -Lc '%G %a' /dev/pps1") == "dialout 660"
     assert service.told("cat /sys/class/pps/pps1/path") == "/dev/ttyS1"
     assert shown(service, "NRestarts", "swath-pps@ttyS1") == "0"
@@ -179,7 +179,7 @@ def test_the_sandbox_denies_forbidden_access(service: Machine, unit: str) -> Non
 def test_a_silent_sensor_does_not_cause_a_restart(service: Machine) -> None:
     service.until("systemctl show -P StatusText swathd | grep 'gnss/rover no data yet'")
     pid = shown(service, "MainPID")
-    service.told("sleep 15")  # its watchdog has ten
+    service.told("sleep 15")  # its watchdog waits for ten
     assert shown(service, "MainPID") == pid
     assert shown(service, "NRestarts") == "0"
 
@@ -206,7 +206,7 @@ def test_a_port_in_use_is_waited_for(service: Machine) -> None:
 @pytest.mark.parametrize("thread", ["scanner/left", "writer"])
 def test_a_hanging_thread_costs_only_a_restart(service: Machine, place: Path, thread: str) -> None:
     """systemd's watchdog ends it; the next one records at once, and repairs the old log meanwhile."""
-    old, pid = next_part(service), shown(service, "MainPID")  # a long one is repaired for minutes here
+    old, pid = next_part(service), shown(service, "MainPID")  # repairing a long log takes minutes here
     service.told("sleep 3")
     stem, fired = Path(old).stem, "journalctl -b -u swathd | grep -c 'Watchdog timeout'"
     before = int(service.shell(fired).output)
@@ -268,7 +268,7 @@ def test_a_full_disk_ends_the_part_and_free_space_begins_another(service: Machin
     service.until("systemctl show -P StatusText swathd | grep '^NOT RECORDING'", COMES_BACK_S)
     service.told("systemctl is-active swathd")
     service.told(f"cp {LOGS}/{old} /vm/full.mcap; rm {LOGS}/filler")
-    assert official_counts(place / "vm/full.mcap")["/scanner/left/raw"] > 0  # it has its end
+    assert official_counts(place / "vm/full.mcap")["/scanner/left/raw"] > 0  # the log is complete
     service.until("systemctl show -P StatusText swathd | grep ^recording", COMES_BACK_S)
     assert newest_log(service) != old
 
@@ -283,4 +283,4 @@ def test_shutdown_ends_the_log(service: Machine, place: Path) -> None:
     codes = aircraft.event_codes(place / "after" / last)
     assert codes[-1] == "session_ended"
     assert official_counts(place / "after" / last)["/events"] == len(codes)
-    assert restarts == 2  # the two of the watchdog
+    assert restarts == 2  # both were the watchdog's

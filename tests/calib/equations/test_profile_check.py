@@ -36,7 +36,7 @@ CONTROL = [
     for k, (x, y) in enumerate([(-132.0, 20.0), (-132.0, -60.0), (-132.0, 80.0), (132.0, 40.0)])
 ]
 NAMES = tuple(f"left.{PARAMETER[kind]}" for kind in KINDS)
-TAUS = Taus(3.0, 3.0, 3.0)  # shorter than a line: constants of a line would not do
+TAUS = Taus(3.0, 3.0, 3.0)  # shorter than a line, so constants of a line would be no good model
 DRAWS = 8
 
 
@@ -134,7 +134,7 @@ def test_planes_and_profiles_agree_within_their_sigmas(flight: Flight, prior: Tr
     assert {one.parameter for one in checked.comparisons} == {"omega_rad", "phi_rad", "kappa_rad"}
     for one in checked.comparisons:
         assert abs(one.normalised) < 3.0, one
-        assert one.told_sigma > 0.9 * one.adjusted_sigma  # the adjustment sees more
+        assert one.told_sigma > 0.9 * one.adjusted_sigma  # the adjustment uses more observations
     # and what is wrong by more than that is seen; points that moved are profiled elsewhere, where a sigma is up to half
     # as large again: of 12 are 8 left, less the 3 that are allowed above
     start = adjusted.calibrations["left"]

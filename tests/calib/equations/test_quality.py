@@ -134,7 +134,7 @@ def test_redundancy_of_correlated_rows_matches_the_dense_solution() -> None:
     (residuals,) = done.quality.residuals
     np.testing.assert_allclose(residuals.sigma_m, np.sqrt(variance + common), rtol=1e-5)
     assert residuals.redundancy.sum() == pytest.approx((expected / np.diag(spread)).sum(), rel=0.01)
-    of_w = expected / (np.diag(spread) * residuals.redundancy)  # the variance that w has
+    of_w = expected / (np.diag(spread) * residuals.redundancy)  # the variance of w
     assert 0.97 < of_w.mean() < 1.03
     assert 0.85 < np.quantile(of_w, 0.01)
     assert np.quantile(of_w, 0.99) < 1.15

@@ -232,7 +232,7 @@ def test_attitude_error_between_knots_is_common_to_a_run() -> None:
             begin = mine.stop
             columns, kept = looks.design[mine, :4], weight[batch.begin + mine.start : batch.begin + mine.stop]
             states = looks.design[mine, 4:12]
-            lever = states[:, 2:5] + states[:, 5:8]  # metres a radian about each axis, shared out to both knots
+            lever = states[:, 2:5] + states[:, 5:8]  # metres per radian about each axis, divided between both knots
             share = states[:, 1]
             common = share * (1.0 - share) * walk * (lever**2).sum(axis=1)
             variance = looks.variance[mine] + len(run.at) * common

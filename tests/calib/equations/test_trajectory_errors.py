@@ -69,7 +69,7 @@ def batch(run: FilterRun) -> FloatArray:
             ahead += np.outer(block.gain[i], block.gain[i]) / block.weighed[i, 1]
             rows.append(np.zeros((m, n)))
             rows[-1][k] = block.h[i]
-        process[k, :, k] = ahead  # what the filter had before the node is the process's where nothing was seen
+        process[k, :, k] = ahead  # without observations the filter's state before the node is the process's
         if not k:
             continue
         phi = np.diag(block.decay[k])

@@ -120,7 +120,7 @@ def test_the_procedure_finds_all_errors_and_is_reproducible() -> None:
     for name, value in true.items():
         assert abs(result.calibrations["left"].value(name) - value) < result.sigmas[f"left.{name}"]
     first, second = result.steps[0].found["left"][0], result.steps[4].found["left"][0]
-    assert abs(first - true["omega_rad"]) > 0.5 * abs(second)  # the first round did leave something
+    assert abs(first - true["omega_rad"]) > 0.5 * abs(second)  # the first round left an error for the second
 
 
 def test_trajectory_errors_move_the_result_within_its_sigma() -> None:
@@ -135,10 +135,10 @@ def test_trajectory_errors_move_the_result_within_its_sigma() -> None:
         part = only(right, partial(_between, low, high))
         (profile,) = survey(part, one.kind, given=[one]).profiles
         for number, line in enumerate((THERE, BACK)):
-            for state in range(number, 6, 2):  # each of the six on one of the two
+            for state in range(number, 6, 2):  # each of the six states is wrong on one of the two lines
                 moved = retold(part, (THERE, BACK), _told_wrong(number, line, state))
                 (other,) = survey(moved, one.kind, given=[one]).profiles
-                expected = -profile.by_trajectory[number][state]  # found corrects what the error shows
+                expected = -profile.by_trajectory[number][state]  # what is found corrects the visible error
                 assert other.found - profile.found == pytest.approx(expected, abs=0.12 * profile.sigma)
         of_trajectory = sum(float(effect @ effect) for effect in profile.by_trajectory.values())
         assert profile.sigma == pytest.approx(math.sqrt(profile.noise_sigma**2 + of_trajectory), rel=0.1)
@@ -184,7 +184,7 @@ def test_noise_moves_the_result_within_its_noise_sigma() -> None:
             replace(flight, swaths=tuple(swaths)).placed(flight.starts()), "pitch", settings=ROUGH, given=given
         ).profiles
         found.append(profile.found)
-        sigmas.append(profile.noise_sigma * 0.03 / math.hypot(0.02, 0.03))  # the noise that is always the same
+        sigmas.append(profile.noise_sigma * 0.03 / math.hypot(0.02, 0.03))  # the noise that never changes
     assert np.std(found) / np.mean(sigmas) == pytest.approx(1.0, abs=0.5)  # 18 draws: ± 3 × 0.17
 
 
@@ -296,7 +296,7 @@ def test_the_picture_is_valid_svg_with_strip_names_and_without_the_formula() -> 
     assert text == svg(profile)
     figure = draw(profile)
     words = " ".join(one.get_text() for one in figure.findobj(Text) if isinstance(one, Text))
-    assert profile.formula.split(" = ")[0] not in words  # which is in the appendix
+    assert profile.formula.split(" = ")[0] not in words  # the formula is in the appendix
     assert {"Before", "After", *profile.names} <= set(words.split())
     assert overlapping(figure) == []
     assert re.search(r"found [+−]0\.\d+ ± 0\.0*\d\d°, ", words)  # the sigma with two digits

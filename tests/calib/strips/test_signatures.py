@@ -103,7 +103,7 @@ def test_a_trajectory_without_velocities_still_shows_a_time_offset(made: Cast) -
         effect_columns(swath.points_t[at], np.ones(len(at), int), swath.time_ns[at], np.ones(len(at)), one)[0]
         for one in (replace(seen, trajectories=[trajectory]), seen)
     )
-    np.testing.assert_allclose(found, expected, rtol=0, atol=0.5)  # of 50 m/s
+    np.testing.assert_allclose(found, expected, rtol=0, atol=0.5)  # metres, of a flight at 50 m/s
 
 
 def test_a_true_calibration_shows_no_error(made: Cast) -> None:
@@ -113,7 +113,7 @@ def test_a_true_calibration_shows_no_error(made: Cast) -> None:
     levels = {one.effect.name: one.level for one in whole.found}
     assert [levels[name] for name in ("roll", "pitch", "heading", "torsion")] == ["none"] * 4
     assert levels["scan direction"] == "not told"
-    assert whole.variance_factor == pytest.approx(0.93, abs=0.1)  # Huber's weights take from the tails
+    assert whole.variance_factor == pytest.approx(0.93, abs=0.1)  # Huber's weights reduce the tails
     assert whole.left_rms_m == pytest.approx(whole.rms_m, rel=0.01)
 
 
@@ -152,7 +152,7 @@ def test_a_wrong_parameter_is_found_with_its_correction(
     assert one.level == "significant"
     assert one.value == pytest.approx(-error, abs=3.5 * one.sigma)
     assert abs(one.value) > 5.0 * one.sigma
-    assert f"to {key} (" in one.words  # the calibration file's, whose unit the number has
+    assert f"to {key} (" in one.words  # the key of the calibration file, in whose unit the number is
     for other in found.values():
         assert other is one or other.level in ("none", "not told", "small"), other.words
 

@@ -244,7 +244,7 @@ def test_at_most_the_requested_number_of_overlap_cells_is_taken() -> None:
 def test_the_cell_size_follows_the_sparsest_strip() -> None:
     dense, thin = surface_flight([level], step_m=0.5), surface_flight([level], step_m=1.0)
     strips = [FlightStrip(dense.swaths[0]), FlightStrip(thin.swaths[0])]
-    assert overlap_cells(strips, StripRules()).cell_m == pytest.approx(4.0, rel=0.1)  # 16 returns of one a square metre
+    assert overlap_cells(strips, StripRules()).cell_m == pytest.approx(4.0, rel=0.1)  # 16 returns at 1 per m²
     assert overlap_cells(strips[:1], StripRules()).cell_m == pytest.approx(2.0, rel=0.1)
 
 

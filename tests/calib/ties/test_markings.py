@@ -121,7 +121,7 @@ SIDE = 2 * round((SETTINGS.square_m / 2 + SETTINGS.search_m) / SETTINGS.cell_m) 
 
 def test_shifts_of_images_to_east_and_north_are_measured() -> None:
     large = pattern(SIDE + 20, 1)
-    first, second = large[10:-10, 10:-10], large[7:-13, 14:-6]  # contents: 3 cells to the north, 4 to the west
+    first, second = large[10:-10, 10:-10], large[7:-13, 14:-6]  # moves the image 3 cells north and 4 west
     shift = shifted(Image(first, 0.4, True), Image(second, 0.4, True), SETTINGS)
     assert isinstance(shift, Shift)
     np.testing.assert_allclose(shift.shift_m, [-4 * SETTINGS.cell_m, 3 * SETTINGS.cell_m], atol=0.005)

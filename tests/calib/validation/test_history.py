@@ -45,7 +45,7 @@ def test_differences_are_tested_against_the_joint_sigma() -> None:
     assert np.degrees(row.sigma) == pytest.approx(0.001 * np.sqrt(2.0))
     assert told.chi2 == pytest.approx(4.5)  # (3 / √2)²
     assert told.freedom == 3
-    assert told.p == pytest.approx(0.2123, abs=1e-4)  # χ² of 3: tables
+    assert told.p == pytest.approx(0.2123, abs=1e-4)  # from tables of χ² with 3 degrees of freedom
     assert not told.moved
     assert row.words == "omega_deg +0.0030 ± 0.0014 (2.1 σ)"
 
@@ -155,7 +155,7 @@ def test_a_parameter_held_at_another_value_is_not_a_change(other: dict[str, Any]
 
 def test_parameters_held_at_nearly_equal_values_are_compared() -> None:
     near = made(2, (0.25, -0.39, 0.6)).changed(lever_arm_x_m=0.002, range_offset_m=0.001, range_scale=2e-6)
-    near = replace(near, ibrc=(IBRC, np.array([0.0, 0.002])), refraction="none")  # the other leaves it unsaid
+    near = replace(near, ibrc=(IBRC, np.array([0.0, 0.002])), refraction="none")  # absent in the other one
     (one,) = history([made(1), near])
     assert one.moved
 

@@ -113,7 +113,7 @@ def test_a_true_calibration_passes_every_applicable_method(
 def test_each_method_uses_the_pairs_it_is_named_after(made: Cast, roofs: Features) -> None:
     found = methods(made, roofs)
     counts = {name: found[name].more.get("pairs") for name in ("crossStripFlight", "secondAltitude", "other")}
-    assert counts == {"crossStripFlight": 4, "secondAltitude": 3, "other": 6}  # of two east-west, two north-south
+    assert counts == {"crossStripFlight": 4, "secondAltitude": 3, "other": 6}  # 2 lines east-west, 2 north-south
 
 
 def test_a_wrong_boresight_fails(made: Cast, roofs: Features) -> None:
@@ -194,7 +194,7 @@ def test_the_tests_reject_at_their_stated_rate() -> None:
         assert 0.45 < column.mean() < 0.55
     assert (
         p[:, 3] < 0.05
-    ).mean() < 0.075  # of the best of several no more than promised, and less where they are alike
+    ).mean() < 0.075  # the best of several is not significant more often than stated, and less often if they are alike
     assert (p[:, 3] < 0.05).mean() > 0.01
 
 
@@ -284,7 +284,7 @@ def test_the_roughness_of_planes_is_estimated_from_the_flight(drawn: tuple[Rows,
     }
     assert np.mean(found[0.0]) < 0.001
     assert np.mean(found[0.002]) == pytest.approx(0.002, abs=0.0007)
-    assert np.mean(found[0.02]) == pytest.approx(FLOOR_M, rel=0.01)  # more is no roughness of a natural plane
+    assert np.mean(found[0.02]) == pytest.approx(FLOOR_M, rel=0.01)  # a natural plane is not rougher
 
 
 def test_a_calibration_error_is_not_taken_for_roughness(drawn: tuple[Rows, TrajectoryPrior]) -> None:
@@ -315,7 +315,7 @@ def test_errors_within_the_sigmas_of_the_calibration_are_undetectable(made: Cast
         calibrations = {"left": with_sigmas(made.truth, phi_rad=sigma)}
         found = validate(made.at_truth(), roofs, calibrations).detectable
         size[sigma] = next(one.size for one in found if one.parameter == "phi_rad")
-    shift = norm.isf(ALPHA / 14.0) + norm.ppf(POWER)  # seven effects, two sides
+    shift = norm.isf(ALPHA / 14.0) + norm.ppf(POWER)  # seven effects are tested on both sides
     assert size[1e-3] == pytest.approx(np.hypot(size[0.0], shift * 1e-3), rel=0.01)
 
 

@@ -310,7 +310,7 @@ def test_heights_above_the_geoid_are_refused(made: Made, tmp_path: Path, capsys:
     assert "orthometric" in line
 
 
-# what intensity does to the range: linear between these, beyond them as at them, which knots there can say exactly
+# effect of intensity on range: linear between these and constant beyond, so knots at these fit exactly
 IBRC = (("intensity", [500.0, 2000.0]), ("correction_m", [0.025, -0.05]))
 
 

@@ -17,7 +17,7 @@ from tests.daemon.one_line import PLAN, Flown
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
 
 ABOVE_M = 1200.0  # above ground; a zone of 150 kHz is 1 km
-ENCODER_COUNTS = 4_194_304  # of a plan that says none
+ENCODER_COUNTS = 4_194_304  # the default of a plan
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_points_match_the_truth_with_apparent_ranges(flown: Flown, tmp_path: Pat
     expected = np.stack(to_map.transform(*truth["left.point_e"].T), axis=1)
     order = np.argsort(truth["left.gps_ns"], kind="stable")
     true_ns = truth["left.gps_ns"][order]
-    of_pulse = np.searchsorted(true_ns, gps_ns - 1000)  # a pulse is 6.7 µs behind the one before
+    of_pulse = np.searchsorted(true_ns, gps_ns - 1000)  # pulses are 6.7 µs apart
     missed = np.full(len(points), np.inf)
     for other in range(3):
         at = np.minimum(of_pulse + other, len(order) - 1)

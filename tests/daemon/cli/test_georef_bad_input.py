@@ -91,7 +91,7 @@ def test_damaged_datagrams_make_the_result_partial(
     assert "partial: " in capsys.readouterr().err
     times_ns = np.sort(flown.truth["left.gps_ns"])
     missing = len(times_ns) - told["counts"]["left"]["read"]
-    assert missing > 1200  # a second of a laser of 1.5 kHz, and some
+    assert missing > 1200  # of a laser of 1.5 kHz, more than a second is missing
 
 
 def test_files_of_a_directory_that_are_not_logs_are_skipped(
@@ -231,7 +231,7 @@ def test_an_interrupt_waits_until_the_processes_have_started(taken: str) -> None
         with held_interrupts():
             if taken == "here":
                 signal.pthread_kill(threading.get_ident(), signal.SIGINT)
-            else:  # Python then calls the handler in this one
+            else:  # Python calls the handler in the main thread
                 handler = signal.getsignal(signal.SIGINT)
                 assert callable(handler)
                 handler(signal.SIGINT, None)

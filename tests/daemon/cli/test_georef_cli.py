@@ -149,7 +149,7 @@ class TestProducts:
     def test_without_a_trajectory_imu_and_receiver_are_navigated(self, flown: Flown, tmp_path: Path) -> None:
         arguments = flown.arguments(tmp_path / "x", "--no-sigma")
         del arguments[arguments.index("--trajectory") : arguments.index("--trajectory") + 2]
-        assert run_app(arguments) in (0, 1)  # so short a flight is not aligned at its very beginning: partial
+        assert run_app(arguments) in (0, 1)  # so short a flight is not aligned at once, so it may be partial
         (flight,) = record(tmp_path / "x")["flights"]
         assert flight["trajectory"]["name"] == "navigation of the log's IMU and GNSS"
         assert flight["trajectory"]["epochs"] > 1000
@@ -472,6 +472,6 @@ def test_georef_with_a_nominal_calibration_prints_a_warning_and_exits_with_1(
     assert told["complete"]
     assert told["verdict"]["level"] == "not to be used"
     las = laspy.read(next((tmp_path / "points").glob("*.laz")))
-    assert np.median(las["sigma_northing"]) > 1.0  # a degree at 100 m and more
+    assert np.median(las["sigma_northing"]) > 1.0  # a degree at more than 100 m
     assert run_app([*arguments, "--overwrite", "--accept-verdict"]) == 0
     assert record(tmp_path / "points")["verdict"]["accepted"]

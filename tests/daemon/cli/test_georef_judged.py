@@ -148,7 +148,7 @@ def test_unusable_points_exit_with_1_however_well_strips_agree(
     said, line = capsys.readouterr(), f"not to be used: trajectory {judged.trajectory('judged')}: {SIGN}"
     assert said.out.startswith(f"Not to be used: trajectory {judged.trajectory('judged')}: ")
     assert said.out.count(str(judged.trajectory("judged"))) == 1
-    assert said.err == f"swath: {line}; use --accept-verdict to accept it\n"  # and nothing of the strips
+    assert said.err == f"swath: {line}; use --accept-verdict to accept it\n"  # nothing is said about the strips
 
 
 def test_strips_of_unusable_points_are_compared_with_the_users_override(

@@ -179,7 +179,7 @@ def test_worker_processes_and_compiling_end_at_a_real_ctrl_c(flown: Flown, tmp_p
     assert rest == NOTHING
     assert not (tmp_path / "out").exists()
     with pytest.raises(ProcessLookupError):
-        os.killpg(process.pid, 0)  # nobody of the group is left
+        os.killpg(process.pid, 0)  # no process of the group remains
 
 
 def test_an_interrupt_waits_until_files_have_their_names(tmp_path: Path) -> None:

@@ -22,10 +22,10 @@ from tests.daemon.one_line import PLAN, Flown, fly
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
-START = dt.datetime(2026, 6, 15, 9, 0, 0, tzinfo=dt.UTC)  # of a plan that says nothing else
+START = dt.datetime(2026, 6, 15, 9, 0, 0, tzinfo=dt.UTC)  # the default of a plan
 UNIX_NS = int(START.timestamp()) * 1_000_000_000
 SCALES_S = {"ptp-utc": 0, "ptp-tai": 37}  # of 1970 against UTC: TAI − UTC since 2017
-OFF_S = 3.0  # of a head that counts from somewhere else
+OFF_S = 3.0  # the error of a head that counts from another moment
 SHORT = (
     PLAN.replace("-1000.0, -80.0", "-50.0, -80.0")
     .replace("[1000.0, -80.0]", "[50.0, -80.0]")

@@ -45,7 +45,7 @@ size_m = [300.0, 300.0]
 heading_deg = 20.0
 houses = 40
 """
-# Boresight and range offset of a scanner that is known beyond them; otherwise what is not known of it blurs them
+# Only boresight and range offset are unknown; further unknown parameters would blur them
 KNOWN = """
 model = "basic"
 [parameters]

@@ -212,6 +212,6 @@ async def test_the_service_waits_for_a_manual_recovery(logs: Path, monkeypatch: 
         await asyncio.sleep(1.0)
         assert events.codes == ["repair_waits"]
         assert not task.done()
-    await asyncio.wait_for(task, HANGS_S)  # given up: it is repaired as if nobody had begun
+    await asyncio.wait_for(task, HANGS_S)  # the wait ends, and the log is repaired as if no repair had begun
     assert events.codes == ["repair_waits", "log_repaired"]
     assert official_counts(logs / CUT.replace(".mcap", ".recovered.mcap"))["/scanner/left/raw"] == 1200

@@ -397,10 +397,10 @@ class TestWires:
         units = [(name, data) for name, data, _ in notes if data != b"closed"]
         assert units == [(unit.source, unit.data) for unit in sent]
         pulled = [name for name, data, _ in notes if data == b"closed"]
-        assert sorted(pulled) == sorted([*SOURCES, "gnss/rover"])  # and all at the end
+        assert sorted(pulled) == sorted([*SOURCES, "gnss/rover"])  # all are closed at the end
         assert notes.index(next(note for note in notes if note[1] == b"closed")) < 30
         edges = [due_ns for name, data, due_ns in notes if name == "pps/main" and data == b""]
-        assert edges[1] - edges[0] == pytest.approx(1e9 + 3600e9, abs=2)  # the second by the clock that was stepped
+        assert edges[1] - edges[0] == pytest.approx(1e9 + 3600e9, abs=2)  # a second, measured by the stepped clock
         assert [round(step_ns / 1e9) for step_ns in steps] == [0, 3600, -3600]
 
     def test_a_wall_clock_without_permission_is_refused(self, monkeypatch: pytest.MonkeyPatch) -> None:

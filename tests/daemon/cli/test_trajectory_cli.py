@@ -67,15 +67,15 @@ class TestSmoothed:
         trajectory, truth = read(made, flown), flown.truth()
         inside = truth.fates(trajectory.time_ns) == 0
         position, attitude = errors(trajectory, truth)
-        assert inside.sum() > (SECONDS - 3) * 100  # from the first position on, though the start was found later
+        assert inside.sum() > (SECONDS - 3) * 100  # from the first position on, although the alignment came later
         assert np.sqrt((position**2).mean(axis=0)).max() < 0.03  # RTK of 1 cm, 1 cm, 2 cm
         assert np.degrees(np.sqrt((attitude**2).mean(axis=0))).max() < 0.2
         normalised = np.concatenate(
             [position / trajectory.position_sigma_l[inside], attitude / trajectory.attitude_sigma_rad[inside]], axis=1
         )
         spread = np.sqrt((normalised**2).mean(axis=0))
-        assert (spread < 3.0).all(), spread  # one flight: its errors are few independent ones
-        assert np.sqrt((normalised**2).mean()) > 0.2  # nor are the sigmas large for fear of that
+        assert (spread < 3.0).all(), spread  # a single flight has few independent errors
+        assert np.sqrt((normalised**2).mean()) > 0.2  # the sigmas are not too large either
 
     def test_the_summary_describes_the_inputs(self, flown: Flown, made: Path) -> None:
         told = summary(made)
@@ -100,7 +100,7 @@ class TestSmoothed:
         assert session["session"] in page
         assert session["imu"]["noise_by_grade"] == {}  # the virtual aircraft's configuration has every key
         assert "data:image/png" in page
-        assert "virtual" in page  # the aircraft
+        assert "virtual" in page  # the name of the aircraft
         assert (made / "a.pdf").read_bytes().startswith(b"%PDF")
 
     def test_event_marks_match_the_position_of_the_aircraft(self, flown: Flown, made: Path) -> None:

@@ -47,7 +47,7 @@ def validated(made: Made, folder: Path, omega_deg: float, *, sigmas: bool = True
 
 def test_a_true_calibration_is_confirmed_by_a_new_measurement(made: Made, tmp_path: Path) -> None:
     code, method = validated(made, tmp_path, 0.0)
-    assert code == 1  # control is seen twice: too little for the test field that was asked for
+    assert code == 1  # strips see control twice, which is too little for the requested test field
     told = json.loads((tmp_path / "out" / "validation.json").read_text())["validation"]
     assert told["undone"] == ["control: strips see control 2 times only; 5 or more are needed"]
     assert method["passed"] is True

@@ -76,7 +76,7 @@ class TestWholeFile:
 
     def test_the_example_names_every_key(self) -> None:
         table = tomllib.loads(AIRCRAFT.read_text())
-        assert set(_absent_keys(Tables, table, "")) == {  # each excludes something that stands there
+        assert set(_absent_keys(Tables, table, "")) == {  # each of these excludes a key of the example
             "gnss.*.setup.port",
             "imu.*.imu_type",
             "imu.*.source_address",

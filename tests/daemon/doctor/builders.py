@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from swath.daemon.doctor.finding import Tree
 
-# what Debian's and Ubuntu's chrony.conf says beside sources of time: conf.d comes before its own makestep
+# Debian's and Ubuntu's chrony.conf without its time sources: conf.d comes before its own makestep
 DEBIAN_CHRONY = """# Include configuration files found in /etc/chrony/conf.d.
 confdir /etc/chrony/conf.d
 pool 2.debian.pool.ntp.org iburst

@@ -234,7 +234,7 @@ def test_a_loadable_driver_is_loaded_by_modprobe(tree: Tree) -> None:
         (0o600, 0, 20, "wrong"),
         (0o660, 0, 5, "wrong"),
         (0o640, 0, 20, "wrong"),
-        (0o066, 990, 20, "wrong"),  # the owner's bits hold for the owner, whatever the others have
+        (0o066, 990, 20, "wrong"),  # the owner's bits count for the owner, even if others have more
     ],
 )
 def test_permissions_are_judged_as_by_the_kernel(tree: Tree, mode: int, uid: int, gid: int, verdict: str) -> None:

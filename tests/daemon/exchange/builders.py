@@ -40,7 +40,7 @@ protocol = "velodyne-vlp16"
 installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]
 """
 
-# a unit as a log has it: source, log time, bytes, and of a datagram its sender
+# a unit in a log: source, log time, bytes, and for a datagram its sender
 Unit = tuple[str, int, bytes, tuple[str, int] | None]
 Content = dict[str, list[tuple[int, bytes, tuple[tuple[str, str], ...]]]]
 

@@ -131,7 +131,7 @@ class TestFiles:
             "gnss-rover.gps": 2, "scanner-top.pcap": 4, "imu-main.log": 2, "pps-main.txt": 1,
         }  # fmt: skip
         assert exported.units == Counter(source for source, *_ in UNITS)
-        assert not (exported.folder / f"scanner-top.pcap{SUFFIX}").exists()  # a pcap holds all of it
+        assert not (exported.folder / f"scanner-top.pcap{SUFFIX}").exists()  # the pcap is complete without it
 
     def test_the_exported_configuration_can_be_loaded_in_place(self, tmp_path: Path) -> None:
         shutil.copytree(ROOT / "fixtures/config", tmp_path / "config", ignore=shutil.ignore_patterns("bad"))
@@ -187,7 +187,7 @@ def there_and_back(folder: Path, config: Config, units: list[Unit]) -> None:
     second = export(folder / "back", folder / "out2")
     names = {path.name for path in report.folder.iterdir() if path.is_file()} - {MANIFEST}
     for name in names:
-        if len(report.units) == 1 or ".pcap" not in name:  # a head's two ports may be laid otherwise
+        if len(report.units) == 1 or ".pcap" not in name:  # datagrams of a head's two ports may be in another order
             assert (second.folder / name).read_bytes() == (report.folder / name).read_bytes(), name
 
 

@@ -122,7 +122,7 @@ class TestRealCaptures:
         for log in made.glob("*.mcap"):
             assert mcap_doctor(log).returncode == 0
             assert sum(count for topic, count in official_counts(log).items() if topic.endswith("/raw")) > 200
-        assert read_log(made).damage == 0  # each status is compared with what stands before it
+        assert read_log(made).damage == 0  # `read_log` compares each status with the units before it
         assert swath("recover", str(made)).returncode == 0
         assert not (made / "recording.json").exists()
 

@@ -210,7 +210,7 @@ def test_verify_reads_again_and_finds_changes(logs: Path, disk: Path) -> None:
     data = bytearray((disk / path.name).read_bytes())
     data[1000] ^= 1
     (disk / path.name).write_bytes(data)
-    os.utime(disk / path.name, ns=(copied.st_atime_ns, copied.st_mtime_ns))  # a disk that forgets changes no time
+    os.utime(disk / path.name, ns=(copied.st_atime_ns, copied.st_mtime_ns))  # a failing disk keeps the file's time
     assert offload_json(logs, disk)[0] == 0
     code, report, _ = offload_json(logs, disk, "--verify")
     assert (code, report["may_be_deleted"]) == (4, [])
@@ -232,7 +232,7 @@ def test_another_log_of_the_same_name_and_size_is_copied(logs: Path, disk: Path,
     code, report, stderr = offload_json(others, disk)
     assert (code, report["may_be_deleted"], report["there"]) == (4, [], [])
     assert "already exists and differs from" in stderr
-    os.utime(path, ns=(later_ns, later_ns))  # the log itself, its time changed by whoever: compared, and found there
+    os.utime(path, ns=(later_ns, later_ns))  # the log's own time was changed, so both are compared, and are equal
     assert offload_json(logs, disk)[1]["may_be_deleted"] == [str(path)]
 
 

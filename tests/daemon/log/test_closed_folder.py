@@ -16,7 +16,7 @@ from swath.daemon.log.directory import nearest_there
 from tests.builders import ROOT
 from tests.daemon.rig import HANGS_S, session_table
 
-# All is loaded before root becomes somebody else, who may not read where it lies.
+# Everything is loaded before root becomes a user who may not read the program's folder.
 AS_NOBODY = """
 import json, os, sys
 from pathlib import Path

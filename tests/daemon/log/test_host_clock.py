@@ -73,7 +73,7 @@ def test_a_timestamp_that_fits_neither_offset_uses_the_read_time(converter: Stam
 @pytest.mark.parametrize("step_ns", [HOUR, -HOUR, SECOND, -SECOND])
 def test_a_unit_between_a_reading_and_the_previous_batch_is_timed(converter: StampConverter, step_ns: int) -> None:
     converter.convert_at(None, 1, pair(1.0))
-    came = np.array([host(0.98)], dtype=np.int64)  # the thread was kept waiting between its read and the clocks'
+    came = np.array([host(0.98)], dtype=np.int64)  # the thread was delayed between its read and the clocks
     assert converter.convert_at(came, 1, pair(1.5, step_ns)).tolist() == [host(0.98)]
     assert converter.ambiguous == 0
 

@@ -275,7 +275,7 @@ def test_a_foreign_chunk_with_a_malformed_channel_costs_only_that_chunk(
     assert read_all(session) == whole[1]
     chunk_damage, index_damage = (entry.damage for entry in session.damage)
     assert chunk_damage.offset == first_chunk
-    assert index_damage.what.startswith("index and footer")  # what was put in has moved all that it points to
+    assert index_damage.what.startswith("index and footer")  # the inserted bytes moved all that it points to
     report = recover(path)
     assert report.damage == [chunk_damage, index_damage]
     assert report.recovered is not None

@@ -86,7 +86,7 @@ def test_every_wrong_byte_of_the_end_is_reported(data: bytes) -> None:
     chunks, _ = scanned(data)
     for at in range(end.offset, len(data)):
         if end.offset + 9 <= at < end.offset + 13:
-            continue  # the CRC of all data, which nobody needs where each chunk has its own
+            continue  # the CRC of all data is unnecessary if each chunk has its own
         content = bytearray(data)
         content[at] ^= 0x10
         found, damage = scanned(bytes(content))
@@ -121,7 +121,7 @@ def test_a_damaged_chunk_head_costs_that_chunk_only(data: bytes) -> None:
     victim = [one for one in records_of(data) if one.opcode == CHUNK][4]
     for at in range(victim.offset, victim.offset + 57):
         if victim.offset + 9 <= at < victim.offset + 25:
-            continue  # first and last time: an index for others, of no use to us
+            continue  # first and last time are an index that other readers use and Swath does not
         content = bytearray(data)
         content[at] ^= 0x41
         found, damage = scanned(bytes(content))

@@ -31,7 +31,7 @@ from tests.fuzz import mcap_parts as mcap
 ROOT = Path(__file__).resolve().parents[3]
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("stranger")]  # its files are read once, by one worker
-PEAK_BYTES = 600 << 20  # of the process, libraries and all
+PEAK_BYTES = 600 << 20  # of the whole process with its libraries
 SECONDS = 60.0
 YEAR_2200_NS = 7_258_118_400_000_000_000
 RUN = """

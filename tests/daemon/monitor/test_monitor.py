@@ -181,7 +181,7 @@ def test_a_device_inside_a_stream_is_decoded_from_it(tmp_path: Path, logs: Path)
         time.sleep(4.0)
         found: dict[str, Any] = {}
 
-        def is_decoded() -> bool:  # a busy machine takes its time, and some seconds are passed over
+        def is_decoded() -> bool:  # on a busy machine this may skip some seconds
             found.update(once(logs)[1])
             return "decoded" in found["sources"]["imu/main"]
 
@@ -472,7 +472,7 @@ def test_an_expensive_parser_gets_only_a_share_of_the_time(tmp_path: Path) -> No
     for second in range(200):
         batch.log_time_ns[:] = (1000 + second) * 1_000_000_000
         decoding.feed("scanner/left", batch)
-    assert time.thread_time() - began_s < 2.0  # of the 10 s that all would cost
+    assert time.thread_time() - began_s < 2.0  # decoding everything would take 10 s
     assert 0.05 <= decoding.share < 0.2
     assert decoding.plain()["share"] == round(decoding.share, 3)
 

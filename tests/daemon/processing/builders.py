@@ -8,7 +8,7 @@ from swath.georef.geodesy.rotations import quaternion_from_rot
 from swath.georef.trajectory.trajectory import Trajectory
 from tests.builders import Flown
 
-STEP_S = 5e-4  # of the true trajectory: a slerp between its epochs is then exact to a micrometre
+STEP_S = 5e-4  # between such epochs of the true trajectory, a slerp is exact to a micrometre
 IBRC = {"intensity": [0.0, 500.0, 2000.0, 65535.0], "correction_m": [0.02, 0.01, -0.005, -0.03]}
 
 

@@ -59,7 +59,7 @@ def test_georef_removes_the_page_of_points_that_it_replaces(
     copy = Path(shutil.copytree(viewed, tmp_path / "out"))
     (copy / "mine").mkdir()
     (copy / "mine/index.html").touch()
-    assert run_app(["view", str(viewed), "-o", str(copy / "other")]) == 0  # shows points elsewhere
+    assert run_app(["view", str(viewed), "-o", str(copy / "other")]) == 0  # this view has points of another folder
     assert run_app(flown.arguments(copy, "--overwrite")) == 0
     assert not (copy / "view").exists()
     assert (copy / "mine/index.html").exists()

@@ -144,7 +144,7 @@ def up_by(one: Log, own_m: float, *, metres: float | None = None, sigmas: float 
         (0.5, {"metres": 2.99}, True, False),  # 6 sigmas
         (0.5, {"metres": 3.01}, False, True),
         (2.0, {"metres": 2.99}, False, False),
-        (2.0, {"metres": 3.01}, False, True),  # 1.5 sigmas, but 60 of the fixes alone
+        (2.0, {"metres": 3.01}, False, True),  # 1.5 sigmas of the trajectory, but 60 of the fixes
     ],
 )
 def test_warnings_and_refusals_begin_at_their_limits(
@@ -230,7 +230,7 @@ def test_a_continental_frame_is_distinguished_from_a_global_one(log: Log) -> Non
     line = log.refused(sure)
     assert "its datum differs" in line
     assert "ETRS89" in line or "ETRF" in line
-    found = log.judged(sure, datum_is_said=True)  # the receiver's may be the other one then
+    found = log.judged(sure, datum_is_said=True)  # the wrong datum may then be the receiver's
     assert not found.refused
     assert "its datum differs" in found.warnings[0]
 

@@ -37,7 +37,7 @@ START_UNIX_NS = int(START.timestamp()) * NS
 UNIX_MINUS_GPS_S, LEAP = 315_964_800, 18
 SECONDS, LATENCY_NS = 20, 2_000_000
 ROLLOVER = dt.timedelta(weeks=1024)
-CLOCK_WRONG_NS = 300_000_000  # of the recording computer, which nobody kept
+CLOCK_WRONG_NS = 300_000_000  # error of the recording computer, which nothing synchronised
 HEAD = 'transport = "udp:0.0.0.0:2368"\ninstallation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n'
 RECEIVER = (
     '[pps.main]\nsource = "/dev/pps0"\n[gnss.rover]\ntransport = "serial:/dev/ttyS0?baud=115200"\nprotocol = "nmea"\n'

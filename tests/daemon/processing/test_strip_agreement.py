@@ -178,6 +178,6 @@ def test_repeatability_equals_the_noise_beyond_the_compared_cells(noise_m: float
     """From 3600 planes through 16 returns the quartile of variances is known to 1 %, its root to half of that."""
     count = np.full(3600, 16.0)
     variance = noise_m**2 * np.random.default_rng(4).chisquare(13, 3600) / 13.0
-    variance[::3] *= 9.0  # what grows on a third of them
+    variance[::3] *= 9.0  # a third of the cells have vegetation
     assert single_return_sigma_m(variance[np.arange(3600) % 3 > 0], count[:2400]) == pytest.approx(noise_m, rel=0.02)
     assert noise_m < single_return_sigma_m(variance, count) < 1.1 * noise_m

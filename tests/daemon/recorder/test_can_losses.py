@@ -34,7 +34,7 @@ def lossy(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
     folder = tmp_path_factory.mktemp("lossy")
     assert run_app(["export", str(flown.log), str(folder / "files")]) == 0
     (files,) = (folder / "files").iterdir()
-    (files / "imu-main.log.swath.csv.gz").unlink()  # which says what the file held
+    (files / "imu-main.log.swath.csv.gz").unlink()  # it would reveal what the file contained
     draws = random.Random(1)
     lines = (files / "imu-main.log").read_text().splitlines(keepends=True)
     begin_s = float(lines[0][1:18])

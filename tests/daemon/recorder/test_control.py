@@ -168,7 +168,7 @@ def test_only_the_owner_of_the_recorder_can_connect(tmp_path: Path, open_folder:
         assert connect_as(0) == 0
         assert os.strerror(connect_as(NOBODY)) == "Permission denied"
         place.chmod(0o666)
-        assert connect_as(NOBODY) == 0  # so it is the mode that refused
+        assert connect_as(NOBODY) == 0  # this shows that the mode caused the refusal
         assert recorder.stop() == 0
 
 

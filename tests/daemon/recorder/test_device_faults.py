@@ -437,8 +437,8 @@ def test_garbage_at_full_rate_does_not_affect_other_sources(tmp_path: Path, logs
     status = content.messages["/status/scanner/right"][-1][1]
     assert status["units"] == int(out.split()[0])
     assert len(content.units["scanner/right"]) == status["written"]
-    assert highest_mb - memory_before_mb < 80  # the queue's 64 MiB and some: less than came
-    assert cpu_s < 1.0  # a quarter of a core, were it as long as the line was busy
+    assert highest_mb - memory_before_mb < 80  # the queue has 64 MiB, less than was sent
+    assert cpu_s < 1.0  # on a real line this would be a quarter of a core
     assert info(logs)["scanner/right"]["decoded"]["bad_messages"] == status["written"]
 
 

@@ -45,7 +45,7 @@ def test_a_unit_alone_sets_the_time_and_is_checked_monitored_and_read_as_a_recei
             recorder.wait_said("imu/main device_opened")
             for message in messages:
                 bus.send(message)
-                time.sleep(1.0 / 118)  # the pace of the device, so that its seconds are seconds
+                time.sleep(1.0 / 118)  # the device's own rate, so that its seconds last a second
             shown = json.loads(swath("monitor", str(tmp_path / "logs"), "--once", "--json").stdout)["sources"]
             assert recorder.stop() == 0, recorder.stderr()
     content = read_log(tmp_path / "logs")

@@ -317,7 +317,7 @@ def test_recording_begins_at_once_whatever_the_directory_contains(tmp_path: Path
     recorder = Recorder(tmp_path, session_table(logs) + scanner(numbers.port))
     with recorder:
         assert "recording test-" in recorder.notify.last("STATUS")
-        assert "repair" not in recorder.stderr()  # READY came before anything was looked at
+        assert "repair" not in recorder.stderr()  # READY came before any log was examined
         recorder.wait_said("scanner/left device_opened")
         numbers.send(500, 0.001)
         assert recorder.stop() == 0

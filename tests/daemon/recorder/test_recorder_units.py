@@ -251,7 +251,7 @@ def test_edges_overwritten_in_the_kernel_are_counted_as_lost_units(overwrites: b
     receiver.receive_once()
     receiver.receive_once()
     session._release()
-    session._open()  # the device was away: what it counted meanwhile was not ours to lose
+    session._open()  # what the device counted while it was away is no loss of the recorder
     receiver.receive_once()
     receiver.finish()
     assert seen == [7, 8, 11, 12, 15, 2, 3]
@@ -361,7 +361,7 @@ def test_the_service_manager_is_notified_on_a_path_and_on_an_abstract_socket(tmp
             service.notify(WATCHDOG="1")
             if time.monotonic() - started > 0.2:
                 break
-    service.notify(WATCHDOG="1")  # and one that has gone is no reason to stop
+    service.notify(WATCHDOG="1")  # a manager that has gone must not stop the recorder either
 
 
 def test_the_watchdog_of_another_process_is_ignored() -> None:

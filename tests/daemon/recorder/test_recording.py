@@ -79,7 +79,7 @@ def test_units_have_the_kernel_timestamps(tmp_path: Path, logs: Path, sender: so
 @pytest.mark.slow
 def test_absent_sensors_are_waited_for_and_never_restart_the_service(tmp_path: Path, logs: Path) -> None:
     config = session_table(logs) + ROVER_CONFIG.format(path=tmp_path / "nothing", fifo=tmp_path / "nofifo")
-    limit_s = 2.0  # of systemd's watchdog; a machine that is busy for a moment is within it
+    limit_s = 2.0  # limit of systemd's watchdog, longer than a busy machine's short delays
     with Recorder(tmp_path, config, watchdog_s=limit_s) as recorder:
         fed = recorder.notify.count("WATCHDOG")
         started = time.monotonic()
@@ -101,7 +101,7 @@ def test_a_blocked_writer_does_not_notify_the_watchdog(tmp_path: Path, logs: Pat
     with Recorder(tmp_path, config, watchdog_s=1.0) as recorder:
         wait_until(lambda: recorder.notify.count("WATCHDOG") >= 3, "watchdog fed while all is well")
         with recorder.stopped_thread("writer"):
-            time.sleep(3.0)  # progress is allowed so long; then nothing may be said any more
+            time.sleep(3.0)  # the time allowed without progress; afterwards the watchdog must not be fed
 
             def is_silent() -> bool:
                 fed = recorder.notify.count("WATCHDOG")

@@ -214,7 +214,7 @@ def test_two_heads_on_one_port_are_two_sources_and_strangers_are_named(tmp_path:
     def send(number: int) -> None:
         for name, last in sent.items():
             sender = senders[name]
-            if name.startswith("scanner") or number % last == 0:  # the stranger at 127.0.0.7 comes least
+            if name.startswith("scanner") or number % last == 0:  # the stranger at 127.0.0.7 sends least
                 sender.sendto(b"%s %d" % (name.encode(), number), ("127.0.0.1", port))
 
     with ExitStack() as stack:

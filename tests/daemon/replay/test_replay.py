@@ -25,7 +25,7 @@ from tests.daemon.builders import ROVER_CONFIG, SREP, Pty, nmea_zda
 from tests.daemon.log_check import LogContent, read_log
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("replay")]  # what is replayed is recorded once, by one worker
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("replay")]  # one worker records once what is replayed
 SECONDS = 18
 # LOCKED after the table's end, too
 TIMED = ROVER_CONFIG.replace('protocol = "nmea"', 'protocol = "nmea"\nleap_seconds = 18')

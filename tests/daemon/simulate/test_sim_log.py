@@ -84,7 +84,7 @@ class TestUnits:
         channels = {one.topic: one for one in summary.channels.values()}
         for device in config.devices():
             for suffix, spec in (("", device.transport), ("/aux", device.auxiliary)):
-                if spec is None or device.source == "corrections/base":  # no virtual base station sends any
+                if spec is None or device.source == "corrections/base":  # the simulation has no base station
                     continue
                 wire = make_wire(device, spec, suffix)
                 channel = channels[wire.topic]
@@ -131,10 +131,10 @@ class TestRecorder:
             assert (one["frequency_ppm"], one["status"]) == (0.0, 0x40)
 
     def test_statuses_come_each_second_and_account_for_all_units(self, made: tuple[SimReport, Path]) -> None:
-        content = read_log(made[1])  # `read_log` compares each with what stands before it
+        content = read_log(made[1])  # `read_log` compares each with the units before it
         for source in SOURCES:
             statuses = content.messages[f"/status/{source}"]
-            assert len(statuses) == SECONDS + 1, source  # and one at the end
+            assert len(statuses) == SECONDS + 1, source  # one more at the end
             steps = np.diff([time_ns for time_ns, _ in statuses])[:-1]
             assert np.all(np.abs(steps - 1e9) < 0.02e9), source
             assert {value["state"] for _, value in statuses} == {"receiving"}

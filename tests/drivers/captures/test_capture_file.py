@@ -170,7 +170,7 @@ def test_fragments_are_put_together_in_any_order(tmp_path: Path) -> None:
     frames = [ETHERNET + piece for piece in [*shuffled, udp_packet(b"next")]]
     units = list(read_pcap(write_pcap(tmp_path / "cut.pcap", frames)))
     assert [unit.data for unit in units] == [payload, b"next"]
-    assert units[0].time_ns // 10**9 == 1_700_000_006  # whole with the last of its fragments
+    assert units[0].time_ns // 10**9 == 1_700_000_006  # the time of the last fragment
     lost = [ETHERNET + piece for piece in pieces[1:]]
     assert list(read_pcap(write_pcap(tmp_path / "lost.pcap", lost))) == []
 
@@ -233,7 +233,7 @@ def test_every_packet_is_a_datagram_or_is_counted(link: int, parts: list[tuple[b
     found = 0
     for start, rest in parts:
         udp = bytearray(start + rest)
-        udp[9:10] = udp[9:10] and b"\x11"  # UDP, so that most get that far
+        udp[9:10] = udp[9:10] and b"\x11"  # the protocol is UDP, so that most packets reach its parser
         packet = ip_packet(link, heads.get(link, b"") + bytes(udp))
         assert packet == udp
         found += packets.add(packet) is not None
@@ -324,7 +324,7 @@ def test_a_reader_with_a_tally_continues_after_damage(tmp_path: Path) -> None:
     path.write_bytes(path.read_bytes() + b"garbage that is no record header, and a length far beyond everything")
     tally = CaptureTally()
     assert [unit.data for unit in read_pcap(path, tally=tally)] == [b"scan", b"scan"]
-    assert tally.damage == 3  # cut when recording, garbage, and a datagram without its other fragments
+    assert tally.damage == 3  # a truncated packet, garbage, and a datagram without its other fragments
     assert "snap length" in tally.first_damage
     assert tally.passed["packets without UDP"] == 1
 

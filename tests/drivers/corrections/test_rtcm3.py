@@ -44,7 +44,7 @@ def test_message_counts_match_another_decoder(name: str) -> None:
     named: Counter[str] = Counter()
     for key, count in entry["messages"].items():
         if key.startswith("RTCM3:"):
-            named[f"RTCM{key[6:].partition('_')[0]}"] += count  # of 4076 it tells kinds apart
+            named[f"RTCM{key[6:].partition('_')[0]}"] += count  # the other decoder counts subtypes of 4076 separately
     assert parser.counters.messages == named
     assert parser.counters.bytes == parser.counters.bytes_framed + parser.counters.bytes_skipped
 

@@ -201,7 +201,7 @@ def test_types_and_lengths_of_rtcm3_messages_match_gpsd(family: str, name: str, 
 # end they are what its message counts as returned and the part of the frame before that.
 BROKEN = {
     "nmea": {
-        "isync.log": (123, 0),  # a comment, and the halves of a sentence that another interrupts
+        "isync.log": (123, 0),  # a comment, and a sentence that another one interrupts
         "pygpsdata-BADHDR.log": (69, 0),
         "pygpsdata-badeof.log": (1, 0),
         "pygpsdata-nmeabadck.log": (138, 2),

@@ -58,7 +58,7 @@ BITS = {
         "GpsCompass": 512,
     },
 }
-# place of a column's value in its field, where columns do not come in that order
+# index of each column's value in its field, where the order differs
 PLACES = {"dcm": (0, 3, 6, 1, 4, 7, 2, 5, 8), "quaternion": (3, 0, 1, 2)}
 
 

@@ -176,7 +176,7 @@ def test_a_silent_caster_does_not_block_the_caller() -> None:
         started_s = time.monotonic()
         with pytest.raises(TransportError, match="not connected in time"):
             NtripTransport(spec, stopped.is_set).open()
-        assert time.monotonic() - started_s < 6.0  # of 8 that it would wait
+        assert time.monotonic() - started_s < 6.0  # it would otherwise wait for 8 s
         hold.set()
 
 

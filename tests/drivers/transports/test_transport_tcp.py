@@ -50,7 +50,7 @@ def test_bytes_arrive_completely_with_the_kernels_stamps_and_can_be_answered() -
         before_ns = time.time_ns()
         peer.sendall(DATA)
         sent_ns = time.time_ns()
-        time.sleep(0.1)  # a stamp of the read would be this late
+        time.sleep(0.1)  # the time of the read would be this late
         blocks = received(transport, len(DATA))
         assert b"".join(block.units.tobytes() for block in blocks) == DATA
         for block in blocks:

@@ -142,7 +142,7 @@ def test_timestamps_come_from_the_kernel_and_are_ordered(sender: socket.socket) 
     for _ in range(300):
         sender.sendto(b"x" * 1206, ("127.0.0.1", port_of(udp)))
     after_sending = time.time_ns()
-    time.sleep(0.05)  # a stamp of the read would fall after this
+    time.sleep(0.05)  # the time of the read would be later
     stamps = np.concatenate([block.kernel_realtime_ns for block in collect(udp, 300)])
     assert stamps.dtype == np.int64
     assert len(stamps) == 300
@@ -164,7 +164,7 @@ def test_the_first_datagram_after_opening_has_its_arrival_timestamp(sender: sock
         udp.close()
         assert block.kernel_realtime_ns is not None
         assert block.kernel_realtime_ns[0] < before_reading_ns
-        time.sleep(0.02)  # the kernel stops stamping, if nobody else wants it
+        time.sleep(0.02)  # the kernel stops, unless another program wants stamps
 
 
 def test_datagrams_of_two_senders_keep_their_peer(sender: socket.socket) -> None:
@@ -194,7 +194,7 @@ def test_received_and_lost_counts_equal_the_datagrams_sent(sender: socket.socket
     assert lost > 0
     assert received > 0
     assert received + lost == sent
-    for _ in range(sent):  # and again: the count is a total
+    for _ in range(sent):  # once more, because the count is a total
         sender.sendto(bytes(length), ("127.0.0.1", port_of(udp)))
     received += sum(len(block.units) for block in iter_until_silent(udp))
     udp.close()
@@ -296,7 +296,7 @@ def test_two_senders_to_one_port_are_two_transports_on_one_socket() -> None:
         assert payloads(collect(left, 1)) == [b"again"]
         left.close()
         right.close()
-    alone = transport(port=port)  # nobody holds the port any more
+    alone = transport(port=port)  # the port is free
     alone.open()
     alone.close()
 

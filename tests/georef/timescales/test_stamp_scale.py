@@ -217,7 +217,7 @@ def test_a_head_set_by_ptp_after_its_start_has_time_from_then_on() -> None:
     assert found.scale is StampScale.TAI
     assert np.array_equal((stamps + found.offset_ns)[begun:], gps[begun:])
     assert "but for 33 % of them, which count from its own start" in found.text
-    stamps[:-10] = gps[:-10] - gps[0] + 7 * NS  # too few to know a scale by
+    stamps[:-10] = gps[:-10] - gps[0] + 7 * NS  # too few stamps to determine a scale
     assert judged(stamps, gps).scale is StampScale.FREE
 
 

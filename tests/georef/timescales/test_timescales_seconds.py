@@ -264,7 +264,7 @@ def test_new_edges_replace_ended_ones_after_twice_their_duration() -> None:
     assert outcome.codes == ["second_known", "second_ambiguous", "relabelled"]
     (_, at), (taken_over_s, text) = [(s, text) for s, code, text in outcome.events if code != "second_known"]
     assert "-0.8 s off" in at
-    assert 280 < taken_over_s < 330  # 100 of the former, twice as many after it; some are missing, some find the train
+    assert 280 < taken_over_s < 330  # 100 s, then twice as many new edges; some are missing, some fit by chance
     assert "-0.8 s" in text
     assert outcome.counts(120, taken_over_s - 1) == {COARSE: taken_over_s - 121}
     assert outcome.counts(taken_over_s + 1)[LOCKED] == len(outcome.states) - taken_over_s - 1

@@ -243,7 +243,7 @@ def separated(mark: str, comma: bool, dms_cells: bool = False) -> str:
 )
 def test_waypoint_columns_may_be_separated_by_delimiters(mark: str, comma: bool, dms_cells: bool) -> None:
     text = separated(mark, comma, dms_cells)
-    trajectory = read(f"{text.rstrip()} 1" if mark == "  " else text)  # an empty cell is none between blanks
+    trajectory = read(f"{text.rstrip()} 1" if mark == "  " else text)  # blanks cannot delimit an empty cell
     assert trajectory.span == (START_NS, START_NS + 300_000_000)
     lat, lon, height = trajectory.geodetic()
     assert np.degrees([lat[3], lon[3]]) == pytest.approx([47.4 + 1.5 / 3600, -8.5], abs=1e-9)

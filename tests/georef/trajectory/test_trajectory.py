@@ -183,8 +183,8 @@ def test_absent_velocities_are_derived_from_positions() -> None:
     found = eastwards(times).with_velocities().velocity_l()
     expected = 60.0 + 2.0 * (times - START_NS) / 1e9
     np.testing.assert_allclose(found[1:-1, 1], expected[1:-1], rtol=1e-9)
-    np.testing.assert_allclose(found[[0, -1], 1], expected[[0, -1]] + [0.05, -0.05], rtol=1e-9)  # half an interval in
-    np.testing.assert_allclose(found[:, [0, 2]], 0.0, atol=1e-3)  # down: the chord of 6 m of the earth
+    np.testing.assert_allclose(found[[0, -1], 1], expected[[0, -1]] + [0.05, -0.05], rtol=1e-9)  # half an interval
+    np.testing.assert_allclose(found[:, [0, 2]], 0.0, atol=1e-3)  # down: a chord over 6 m of the earth
 
 
 def test_velocities_are_not_derived_across_gaps_or_for_a_single_epoch() -> None:

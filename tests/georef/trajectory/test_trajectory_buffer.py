@@ -97,7 +97,7 @@ def test_late_and_repeated_rows_are_counted_and_dropped() -> None:
 )
 def test_rows_without_a_solution_are_refused_by_their_status(protocol: str, bad: int, taken: int) -> None:
     rows = solutions(100)
-    rows["status"] = 3  # GOOD, or some info of INSNavGeod without error
+    rows["status"] = 3  # GOOD, and for INSNavGeod some info without an error
     rows["status"][40:50] = bad
     buffer = filled(rows, protocol=protocol)
     assert len(buffer.snapshot()) == buffer.counts["taken"] == taken
@@ -159,7 +159,7 @@ def test_discarded_epochs_use_no_memory_and_change_no_pose() -> None:
         buffer.append(rows[first : first + 50])
         buffer.forget_before(int(rows["gps_ns"][first]) - 3_000_000_000 + 1)
     snapshot = buffer.snapshot()
-    assert len(snapshot) == 350  # of the last append, and the 3 s before it
+    assert len(snapshot) == 350  # the last append and the 3 s before it
     assert snapshot.position_e.base is not None
     assert len(snapshot.position_e.base) < 5000
     at = np.arange(*snapshot.span, 3_000_000)

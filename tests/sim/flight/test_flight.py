@@ -436,7 +436,7 @@ def test_a_start_taxies_runs_and_climbs_out(from_ground: Trajectory) -> None:
     assert np.abs(np.degrees([roll[on_ground], pitch[on_ground]])).max() < 1e-6
     assert np.gradient(speed, 0.1)[on_ground].max() == pytest.approx(2.5, abs=0.01)
     climb = -velocity[:, 2]
-    assert climb.max() <= 5.0 + 1.5  # the air's own motion on top
+    assert climb.max() <= 5.0 + 1.5  # moving air adds to it
     assert climb.max() > 4.5
     assert math.degrees(pitch.max()) > 5.0
     assert from_ground.lines[0].start_s < 400.0

@@ -563,7 +563,7 @@ def test_its_configuration_is_valid(protocol: str) -> None:
     table = flight(protocol=protocol, **second).plan.tables.gnss["rover"]
     config = GnssConfig.model_validate(config_table(table, "rover", "serial:/dev/ttyUSB0?baud=460800", LEAP_S))
     assert (config.protocol, config.pps) == (protocol, "main")
-    assert config.leap_seconds == (LEAP_S if protocol == "nmea" else None)  # the others say it themselves
+    assert config.leap_seconds == (LEAP_S if protocol == "nmea" else None)  # other protocols state it
     assert config.lever_arm_m == LEVER_ARM
     assert config.secondary_lever_arm_m == second.get("secondary_lever_arm_m")
     unwired = table.model_copy(update={"pps": None})

@@ -70,7 +70,7 @@ def test_the_noiseless_solution_equals_place_and_velocity_of_the_antenna() -> No
 def test_novatel_velocity_lags_the_position_by_its_stated_latency() -> None:
     aircraft = Circling()
     epochs = receiver(aircraft, noise=False, rate_hz=20, protocol="novatel").epochs(0, 100)
-    assert epochs.velocity_age_s[0] == 0.0  # nothing was before the start
+    assert epochs.velocity_age_s[0] == 0.0  # no epoch precedes the start
     assert (epochs.velocity_age_s[1:] == 0.05).all()
     true_l = aircraft.velocity_of(LEVER_ARM, epochs.time_s - epochs.velocity_age_s)
     assert np.abs(epochs.velocity_l - true_l).max() < 2e-6

@@ -146,7 +146,7 @@ def test_host_timestamps_lag_by_the_jitter_and_keep_their_order() -> None:
     lag_s = stamps - [one.time_s for one in quiet]
     assert np.diff(stamps).min() >= 0.0
     assert lag_s.min() >= 0.0
-    assert 60e-6 < lag_s.mean() < 120e-6  # order makes the mean of 60 µs longer: a late frame holds up those behind it
+    assert 60e-6 < lag_s.mean() < 120e-6  # a late frame delays those after it, so the mean exceeds 60 µs
     assert {one.source for one in rough} == {"imu/main"}
 
 

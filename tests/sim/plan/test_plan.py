@@ -245,7 +245,7 @@ def type_of(field: FieldInfo) -> str:
         f"{sign} {getattr(item, name):.10g}"
         for item in field.metadata
         for name, sign in BOUNDS.items()
-        if getattr(item, name, 2**63) != 2**63  # the bound of a seed says nothing
+        if getattr(item, name, 2**63) != 2**63  # the page does not state a seed's bound
     ]
     return f"{words(field.annotation, field.metadata)} {' and '.join(bounds)}".strip()
 

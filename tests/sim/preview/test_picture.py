@@ -108,7 +108,7 @@ KINDS = {
     "vlp16": scanner(kind="vlp16", scan_hz=10.0, installation=ACROSS),
     "os1": scanner(kind="os1", scan_hz=20.0, installation=ACROSS),
 }
-SPAN_S = 0.4  # whole turns and swings of all
+SPAN_S = 0.4  # each scanner makes whole turns or swings in it
 HEADS: dict[str, Callable[[ScannerTable, str], Vlp16Head | Os1Head | LineHead]] = {"vlp16": Vlp16Head, "os1": Os1Head}
 
 

@@ -108,7 +108,7 @@ def test_risley_pair_follows_the_formula_sheet() -> None:
 def test_rates_and_accelerations_are_derivatives_of_the_angle(motion: motions.Motion) -> None:
     time_s, step_s = 3.0 + np.linspace(0.0, 0.05, 2001)[:-1] + 1.234e-5, 1e-7
     before, at, after = (motion(time_s + shift) for shift in (-step_s, 0.0, step_s))
-    smooth = np.abs(after.angle_rad - before.angle_rad) < 1e-3  # where no facet or turn ends
+    smooth = np.abs(after.angle_rad - before.angle_rad) < 1e-3  # except where a facet or turn ends
     assert smooth.mean() > 0.99
     rate = (after.angle_rad - before.angle_rad) / (2 * step_s)
     np.testing.assert_allclose(rate[smooth], at.rate_rps[smooth], atol=2e-5)

@@ -156,7 +156,7 @@ def test_packed_slots_keep_their_truth() -> None:
     np.testing.assert_array_equal(tight.pulse_width_ns, 3 * tight.range_m)
     np.testing.assert_array_equal(rows["range_m"], tight.range_m)
     assert rows["return_number"].tolist() == [[1, 2, 3]] * 5
-    assert measured.range_m[0, 0] == 0.0  # what was handed in stays
+    assert measured.range_m[0, 0] == 0.0  # the input is not changed
 
 
 def test_a_footprint_on_a_slope_lengthens_the_echo() -> None:

@@ -142,7 +142,7 @@ def test_empty_slots_in_between_are_removed_on_the_wire() -> None:
 @pytest.mark.parametrize("kind", ["oscillating", "polygon"])
 def test_bytes_do_not_depend_on_how_time_is_cut(kind: str, zone: str) -> None:
     table = scanner(kind=kind, zone=zone, prf_hz=200_000.0)
-    idle, ranges_m = [(10.02, 10.35)], (740.0, 1400.0)  # some in the zone before, which ends at 749.5 m
+    idle, ranges_m = [(10.02, 10.35)], (740.0, 1400.0)  # some echoes are in the previous zone, which ends at 749.5 m
     one = speak(table, (10.0, 10.02, 10.35, 10.4), noise=True, idle=idle, ranges_m=ranges_m)
     cuts = (10.0, 10.000003, 10.0111, 10.0111, 10.02, 10.13, 10.2, 10.35, 10.350001, 10.3777, 10.4)
     other = speak(table, cuts, noise=True, idle=idle, ranges_m=ranges_m)
@@ -216,7 +216,7 @@ def test_units_arrive_after_a_fixed_time_and_jitter_in_order() -> None:
     assert (np.diff(times) >= 0.0).all()
     late = times - pulses["time_s"][9::10] - PROCESSING_S
     assert late.min() >= 0.0
-    assert late.mean() == pytest.approx(30e-6, rel=5 / np.sqrt(len(late)))  # who waits is little: one in 100 µs
+    assert late.mean() == pytest.approx(30e-6, rel=5 / np.sqrt(len(late)))  # only one in 100 µs waits for another
     assert [unit.data for unit in noisy.units] == [unit.data for unit in quiet.units]
     assert {unit.source for unit in noisy.units} == {"scanner/left"}
 

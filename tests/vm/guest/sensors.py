@@ -68,7 +68,7 @@ def main() -> None:
     begin = told = time.monotonic()
     while (now := time.monotonic()) < begin + asked.seconds:
         for name, (send, rate) in senders.items():
-            with contextlib.suppress(BlockingIOError):  # nobody reads at the other end: sent when somebody does
+            with contextlib.suppress(BlockingIOError):  # no one reads at the other end, so the unit is sent later
                 while sent[name] < (now - begin) * rate:
                     send(sent[name])
                     sent[name] += 1

@@ -26,7 +26,7 @@ def begin() -> int:
         os.system(f"mount -t tracefs nodev {TRACING}")
     for event in ("sys_enter_fdatasync", "sys_exit_fdatasync"):
         (TRACING / f"events/syscalls/{event}/filter").write_text('comm == "writer"')
-    (TRACING / "trace_clock").write_text("mono")  # empties the buffer of what others did before
+    (TRACING / "trace_clock").write_text("mono")  # this also empties the buffer of earlier events
     return os.open(TRACING / "trace_pipe", os.O_RDONLY | os.O_NONBLOCK)
 
 

@@ -25,7 +25,7 @@ from tests.calib.cast_flight import VILLAGE, Cast, Line, cast_flight
 pytestmark = [pytest.mark.xdist_group("kernels"), pytest.mark.slow]
 
 LINES: tuple[Line, ...] = ((-200, 0, 200, 0, 850), (200, 60, -200, 60, 850))
-KNOWN_RAD = math.radians(0.02)  # one sigma that the start says of its heading
+KNOWN_RAD = math.radians(0.02)  # the heading's stated sigma at the start
 NOBODY: frozenset[str] = frozenset()
 
 

@@ -38,7 +38,7 @@ def test_a_navigated_flight_names_its_instruments(made: Made, tmp_path: Path) ->
     assert 4 <= satellites <= 40
     for key, value in told.items():
         assert isinstance(value.content, str | int | float | tuple)
-        told_value(key, value.content)  # each is an attribute, and such as it takes
+        told_value(key, value.content)  # raises unless the attribute exists and takes the value
 
 
 def test_a_supplied_trajectory_names_no_instruments(made: Made, tmp_path: Path) -> None:

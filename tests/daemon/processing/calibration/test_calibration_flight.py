@@ -71,7 +71,7 @@ def test_parameters_of_an_unknown_scanner_are_refused_before_the_log_is_read(
     capsys: pytest.CaptureFixture[str],
     option: tuple[str, str],
 ) -> None:
-    monkeypatch.setattr(flights, "read_clocks", None)  # the first that takes long
+    monkeypatch.setattr(flights, "read_clocks", None)  # the first step that takes long
     trajectory = str(made.flown.folder / "true_trajectory.csv")
     log, output, same = str(made.flown.log), str(tmp_path / "left.toml"), ("--trajectory-datum", "same")
     assert run_app(["calibrate", log, "-o", output, "--trajectory", trajectory, *same, *option]) != 0

@@ -258,7 +258,7 @@ def level_flight(
     ("flown", "words"),
     [
         (level_flight(1.0, 0.1), []),
-        (level_flight(1.0 - np.radians(30.0), 0.0), []),  # as much wind from the side as there is
+        (level_flight(1.0 - np.radians(30.0), 0.0), []),  # the strongest crosswind that is accepted
         (level_flight(1.0, np.pi - 0.05), ["its z axis points up, so the body would fly upside down"]),
         (level_flight(1.0 + np.pi / 2, 0.0), ["its x axis points +90° beside the course"]),
         (level_flight(1.0 - np.radians(100.0), 0.0), ["its x axis points -100° beside the course"]),

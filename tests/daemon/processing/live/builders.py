@@ -42,7 +42,7 @@ on_lines_only = false
 prf_hz = 3000
 on_lines_only = false
 """
-PART_MINUTES = 0.035  # two seconds
+PART_MINUTES = 0.035  # about two seconds
 
 
 def config_of(wires: Path, folder: Path) -> str:

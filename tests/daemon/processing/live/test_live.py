@@ -238,7 +238,7 @@ class TestStatus:
         found["points_per_s"] = dict.fromkeys(found["points"], 8000)
         for one in found["latency_s"].values():
             if one["pulse"]:
-                one["pulse"]["p95"] = 0.4  # a flight of 7 s, of which most waited for the clock
+                one["pulse"]["p95"] = 0.4  # the flight lasts 7 s, most of which is spent waiting for the clock
         late = copy.deepcopy(found)
         late["latency_s"]["scanner/left"]["pulse"]["p95"] = 12.0
         wrong: list[Told] = [

@@ -45,7 +45,7 @@ class TestFrame:
             products.look_for_room()
             products.begin(trajectory)
             assert products.frame is not None
-            products.frame.origin = maps.map_from_e(trajectory.position_e[:1])[0]  # round numbers of neither
+            products.frame.origin = maps.map_from_e(trajectory.position_e[:1])[0]  # not a round number in either unit
             ground = Utm().map_from_e(trajectory.position_e)[-1]
             ground = ground + np.random.default_rng(8).uniform(-400, 400, (5000, 3))
             products.take("left", points_at(ground / maps.unit_m), trajectory, 77 * SECOND_NS)
@@ -89,7 +89,7 @@ class TestFrame:
         for k, turned in enumerate([*half_turns, *half_turns[::-1], *others]):
             stretch = np.diag([1.0, 1.0, 1.0] if k % 2 else [2.3, 2.3, 1.0])
             frame = LocalFrame(position_e, None)
-            frame._rot_points_from_enu = stretch  # what the frame takes for east, north, up
+            frame._rot_points_from_enu = stretch  # replaces the axes east, north, up of the frame
             _, q = frame.pose_of(position_e, np.roll(turned.as_quat(), 1))
             expected = np.roll(turned.as_quat(), 1)
             np.testing.assert_allclose(q * np.sign(q @ expected), expected, rtol=0, atol=1e-8)

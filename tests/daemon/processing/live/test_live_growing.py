@@ -25,7 +25,7 @@ SECONDS = 6.5
 
 def test_points_made_during_recording_equal_those_of_the_replay(tmp_path: Path) -> None:
     """The bytes are equal across part changes; nothing is skipped, and the delay is reported."""
-    warm_up([])  # else the command compiles before it follows anything, and says so
+    warm_up([])  # otherwise the command compiles first and reports that
     logs, points, said, plan = (tmp_path / name for name in ("logs", "points.npy", "said", "plan.toml"))
     logs.mkdir()
     plan.write_text(PLAN.replace("rate_hz = 1\n", "rate_hz = 20\n"))

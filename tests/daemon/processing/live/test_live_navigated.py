@@ -51,7 +51,7 @@ SETTLED_S = 8.0  # of the points: before, the filter has hardly begun
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     """Record a flight on wires and follow it live, in three processes."""
-    warm_up([])  # else the command compiles at the lowest priority before it follows anything
+    warm_up([])  # otherwise the command first compiles at the lowest priority
     folder = tmp_path_factory.mktemp("end_to_end")
     logs, points, said, plan = (folder / name for name in ("logs", "points.npy", "said", "plan.toml"))
     logs.mkdir()
@@ -71,7 +71,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
             assert recorder.stop() == 0
         _, trouble = live.communicate(timeout=HANGS_S)
     assert (flying.returncode, live.returncode) == (0, 0), trouble
-    again = folder / "again"  # the same flight into a log, for on wires the truth is not written
+    again = folder / "again"  # the same flight as a log, because the truth is not written for a flight on wires
     assert run_app(["sim", "fly", str(plan), "-o", str(again), "--seconds", f"{SECONDS:g}"]) == 0
     return Recorded(logs, np.load(points), np.load(again / "truth.npz"))
 

@@ -17,7 +17,7 @@ from swath.georef.records import IMU_DTYPE
 S = 1_000_000_000
 RATE_HZ = 100.0
 BEGIN_NS = 1_479_297_618 * S
-FIRST = 400  # sample from which they are spoilt
+FIRST = 400  # the first spoilt sample
 Spoil = Callable[[StructArray, Int64Array, slice], None]
 
 

@@ -69,7 +69,7 @@ class TestSameBytes:
         with distributed.LocalCluster(
             n_workers=2,
             threads_per_worker=1,
-            processes=False,  # two workers that are told everything over TCP, and need not be started
+            processes=False,  # two workers in threads, which still communicate by TCP
             dashboard_address=None,
             protocol="tcp",
             host="127.0.0.1",

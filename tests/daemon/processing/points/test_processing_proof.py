@@ -87,7 +87,7 @@ def georeferenced(flown: Flown, folder: Path) -> tuple[Points, ByteArray]:
     for name, data in flown.files.items():
         (folder / name).write_bytes(data)
     text = config_text(flown.plan, default_wires(flown.plan), ".").partition("[output]")[0]  # points stay in e
-    text = text.replace("range_max_m = 130.0", "range_max_m = 200.0")  # it measures with errors, the gate knows none
+    text = text.replace("range_max_m = 130.0", "range_max_m = 200.0")  # the gate allows for no errors of range
     config = parse_config(text, folder / "swath.toml")
     attachments = {f"geometry/{name}": data for name, data in flown.files.items() if name == "left.json"}
     calibration = flown.files["left.true.toml"].decode()

@@ -233,7 +233,7 @@ def test_ouster_points_match_the_manufacturers_decoder(capture: str) -> None:
         ranges, stamps, theirs = archive["RANGE"], archive["timestamp"], archive["xyz_first_200_columns"]
     column = ouster_cases.measurement_ids(rows, parser.head.columns_per_frame)
     mine = (column < 200) & (rows["device_time_ns"] == stamps[column])
-    mine &= np.rint(rows["range_m"] * 1000) == ranges[rows["channel"], column]  # the second of two is not in there
+    mine &= np.rint(rows["range_m"] * 1000) == ranges[rows["channel"], column]  # second returns are not in `ranges`
     assert mine.sum() == np.count_nonzero(ranges[:, :200]) > 1_500
     points = points_s(model_of("ouster", parser), rows[mine])
     np.testing.assert_allclose(points, theirs[rows["channel"][mine], column[mine]], rtol=0, atol=1e-5)

@@ -32,8 +32,8 @@ def test_a_shift_between_strips_is_found_on_a_slope_to_a_tenth_of_a_millimetre(s
     for key, truth in (("median_m", -0.07), ("mean_m", -0.07), ("rms_m", 0.07), ("p95_m", 0.07), ("max_m", 0.07)):
         assert row[key] == pytest.approx(truth, abs=1.5e-4), key  # coordinates are rounded to 0.1 mm
     cell_m2 = shifted.cells.frame.cell_m**2
-    assert 0.98 * row["compared_cells"] <= row["cells"] <= row["compared_cells"]  # slivers at edges tell no plane
-    assert row["cells"] * cell_m2 == pytest.approx(300.0 * 40.0, rel=0.12)  # but for cells that the edges cut
+    assert 0.98 * row["compared_cells"] <= row["cells"] <= row["compared_cells"]  # slivers have no plane
+    assert row["cells"] * cell_m2 == pytest.approx(300.0 * 40.0, rel=0.12)  # cells at the edges are missing
     together = shifted.overlap.numbers()
     assert together is not None
     assert (together["median_m"], together["p95_m"]) == (-0.07, 0.07)

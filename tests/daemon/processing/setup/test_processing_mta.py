@@ -53,7 +53,7 @@ LOST = (
     411,
     412,
     502,
-)  # the first too: no echo may stand in a record whose pulse left before all that is known
+)  # including the first: its echoes could belong to pulses before the log
 ARM_B = np.array([0.4, -0.2, 0.9])
 ABOVE_M, GROUND_M, HILL_M, HILL_LENGTH_M = 1200.0, 500.0, 330.0, 2600.0
 
@@ -138,7 +138,7 @@ def flight() -> Flight:
     order = np.lexsort([wire, record])
     pulse, range_m, record, wire = pulse[order], range_m[order], record[order], wire[order]
     slot = np.arange(len(record)) - np.searchsorted(record, record)
-    there = (slot < SLOTS) & (wire > 0) & (record < PULSES - 1)  # those of the last one wait for its successor
+    there = (slot < SLOTS) & (wire > 0) & (record < PULSES - 1)  # echoes in the last record would wait for the next one
     pulse, range_m, record, wire, slot = (one[there] for one in (pulse, range_m, record, wire, slot))
     cells = np.zeros((2, PULSES, SLOTS), np.int64)
     cells[:, record, slot] = wire, pulse

@@ -135,7 +135,7 @@ def test_the_calibration_is_unchanged_and_the_table_lists_the_corrections(
     assert "file tells no sigmas, and no sigma here contains its errors" in told  # the true calibration's
     row = next(line for line in told.splitlines() if line.startswith(f"{made.flight.swaths[LIFTED].strip:02d} "))
     assert "constant" in row
-    assert "not determined" in row  # its place in plan, over hardly anything but level ground
+    assert "not determined" in row  # over almost level ground its horizontal shift is not determined
     assert "→" in row
     assert str(tmp_path / "out" / ADJUSTMENT) in told
 
@@ -228,7 +228,7 @@ def test_mistakes_are_reported_in_one_line_and_leave_no_files(
 ) -> None:
     output = tmp_path / "out"
     times = [(int(swath.time_ns[0]), int(swath.time_ns[-1])) for swath in made.flight.swaths]
-    beginnings = [(start, start + 2_500_000_000) for start, _ in times[:2]]  # of opposite lines: their far ends
+    beginnings = [(start, start + 2_500_000_000) for start, _ in times[:2]]  # lines are opposite: these are far apart
     far = tmp_path / "far.csv"
     far.write_text("name,lat_deg,lon_deg,h_ellipsoidal_m,sigma_m\na,47.5,9.5,450,0.02\n")
     swapped = tmp_path / "swapped.txt"
@@ -324,4 +324,4 @@ def test_a_trajectory_is_written_back_about_the_plumb_line_of_its_input(
     read = read_trajectory(path.read_bytes(), path.name)
     for turned, same in ((read, False), (read.with_deflection(*xi_eta_rad), True)):
         attitudes = np.array(turned.attitude()), np.array(outcome.adjusted.trajectories[0].attitude())
-        assert np.allclose(*attitudes, rtol=0.0, atol=1e-8) == same  # there and back but for the product of ξ and η
+        assert np.allclose(*attitudes, rtol=0.0, atol=1e-8) == same  # the inverse is exact but for ξ · η

@@ -203,7 +203,7 @@ def test_inspvas_matches_edie(name: str, log: str) -> None:
     parser = NovatelParser(DeviceSettings("gnss/rover"), wanted=(InsSolution,))
     rows = rows_of(parse_novatel(recording(name), parser), InsSolution)
     if name == "bestpos.gps":
-        rows = rows[np.isnan(rows["position_sigma_l"][:, 0])]  # INSPVAX says sigmas
+        rows = rows[np.isnan(rows["position_sigma_l"][:, 0])]  # INSPVAX has sigmas
     expected = ascii_logs(name, log)
     assert len(rows) == len(expected) > 0
     for row, line in zip(rows, expected, strict=True):

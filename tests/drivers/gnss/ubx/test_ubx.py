@@ -127,7 +127,7 @@ def test_fields_match_pyubx2(identity: str) -> None:
             for field, (attribute, factor) in fields.items():
                 value = getattr(theirs, attribute)
                 if attribute == "height" and identity == "NAV-HPPOSLLH":
-                    assert getattr(ours, field) == pytest.approx(value, abs=1.0)  # theirs has the 0.1 mm part added
+                    assert getattr(ours, field) == pytest.approx(value, abs=1.0)  # theirs includes the 0.1 mm part
                 else:
                     assert getattr(ours, field) == pytest.approx(value * factor, rel=1e-7, abs=1e-6), (name, field)
             compared += 1
@@ -384,7 +384,7 @@ def test_a_valid_leap_second_count_does_not_make_the_time_valid() -> None:
 
 def test_the_second_follows_itow_whatever_leap_count_utc_uses() -> None:
     """The first NAV-PVT after an insertion comes before the first message with the new count; the second is right."""
-    late = pvt(NOON_MS + 1000, itow_ms=NOON_MS + 2000)  # UTC one second behind what 18 s would give
+    late = pvt(NOON_MS + 1000, itow_ms=NOON_MS + 2000)  # UTC is a second earlier than with 18 s
     records, _ = parse(timegps(NOON_MS), pvt(NOON_MS), late, timegps(NOON_MS + 2000, leap=19), late)
     said = [message.time for message in times(records) if message.message == "NAV-PVT"]
     assert [tag.leap_seconds for tag in said] == [18, 18, 19]
@@ -408,7 +408,7 @@ def test_utc_with_a_stale_leap_count_gives_the_second_of_its_own_itow(name: str,
     (message,) = times(parse(frame)[0])
     assert (message.message, message.valid, message.time.leap_seconds) == (name, True, leap)
     assert whole_gps_ns(message.time, None) == gps_ns_from_week(WEEK, NOON_MS * MS)
-    messages = times(parse(timegps(NOON_MS), frame)[0])  # a count that the receiver vouches for sets UTC right
+    messages = times(parse(timegps(NOON_MS), frame)[0])  # the confirmed count corrects UTC
     assert [item.time.leap_seconds for item in messages] == [18, 18]
     assert whole_gps_ns(messages[1].time, None) == gps_ns_from_week(WEEK, NOON_MS * MS)
 

@@ -43,7 +43,7 @@ from tests.drivers.imu_dbc import (
     without,
 )
 
-KINDS = {  # rule -> the parts of a sample, the signal map without what the rule has not
+KINDS = {  # rule -> kinds of frames in a sample, and signals that the map lacks under this rule
     "last": ("AGT", ("pps_ticks",)),
     "first": ("AGT", ("pps_ticks",)),
     "repeat": ("AG", ("sample_ticks", "pps_ticks", "temperature")),

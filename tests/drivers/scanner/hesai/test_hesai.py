@@ -212,7 +212,7 @@ def test_design_angles_are_used_without_an_angle_file() -> None:
         ("QT64", QT64, 0),
         ("QT128", QT128, 5e-5),
         ("XT16", XT16, 0),
-        ("XT32M", XT32M2X, 0.25),  # this one is measured, not designed
+        ("XT32M", XT32M2X, 0.25),  # this table is measured instead of designed
     ):
         own = read_angle_file((FIXTURES / "hesai" / f"calib_Pandar{name}.csv").read_bytes(), head)
         np.testing.assert_allclose(head.beams.elevation_deg, own.elevation_deg, rtol=0, atol=within_deg)

@@ -67,7 +67,7 @@ def avia_by_hand() -> bytes:
             60,
             0x02,
         ),  # 1.999849 m, 45° to the right, 44.9957° up (45° − 0.21356/1414.1/2 rad); noise with medium confidence
-        7: (-2000, 0, 0, 70, 0x10),  # behind; the return's number is no doubt
+        7: (-2000, 0, 0, 70, 0x10),  # behind the head; bits of the return's number do not mean noise
         95: (0, 0, -2500, 80, 0x00),  # straight down
     }
     rows = [struct.pack("<3i2B", *points.get(at, (0, 0, 0, 0, 0))) for at in range(96)]

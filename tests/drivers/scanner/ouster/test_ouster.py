@@ -122,7 +122,7 @@ def test_points_match_the_manufacturers_decoder(capture: str) -> None:
         ranges, stamps, theirs = archive["RANGE"], archive["timestamp"], archive["xyz_first_200_columns"]
     column = measurement_ids(rows, parser.head.columns_per_frame)
     mine = (column < 200) & (rows["device_time_ns"] == stamps[column])
-    mine &= np.rint(rows["range_m"] * 1000) == ranges[rows["channel"], column]  # the second of two is not in there
+    mine &= np.rint(rows["range_m"] * 1000) == ranges[rows["channel"], column]  # second returns are not in `ranges`
     assert mine.sum() == np.count_nonzero(ranges[:, :200])
     points = beam_points(rows[mine], parser.head)
     np.testing.assert_allclose(points, theirs[rows["channel"][mine], column[mine]], atol=1e-5)  # theirs: 4 bytes each

@@ -25,7 +25,7 @@ from tests.drivers.scanner.ouster.builders import lidar_packets
 DIGESTED = ("OS-0-32-U1_v2.2.0_1024x10", "OS-1-32-G_v2.1.1_1024x10")
 SINGLE = "OS-0-32-U1_v2.2.0_1024x10-single-packet"
 THREE = "OS-1-128_v2.3.0_1024x10_lb_n3"
-# words of which the fields are cut; ENCODER_COUNT is left out where packets hold none, FRAME_ID is one a packet
+# raw words that contain the fields; without ENCODER_COUNT if packets lack it, FRAME_ID once per packet
 NOT_DECODED = {"RAW32_WORD1", "RAW32_WORD2", "RAW32_WORD3", "RAW32_WORD4"}
 DTYPES = {"RANGE": "u4", "RANGE2": "u4", "SIGNAL": "u2", "SIGNAL2": "u2", "NEAR_IR": "u2"}  # the rest is of one byte
 

@@ -112,7 +112,7 @@ def test_compiled_and_plain_code_give_the_same_rows_for_any_pulses(named: tuple[
     for slots in (2, 3) if named else (1, 2, 5):
         made = random_slots(slots, named, seed)
         expected, table = returns_table(made.content.size), returns_table(made.content.size)
-        table.view(np.uint8)[:] = 0xA5  # what was there before
+        table.view(np.uint8)[:] = 0xA5  # arbitrary previous content
         count = made.fill(expected)
         assert count > 500
         assert fill(made, table) == count

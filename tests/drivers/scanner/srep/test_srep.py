@@ -284,7 +284,7 @@ def test_repeated_and_reordered_datagrams_give_each_pulse_once_in_time_order(cut
     errors = parser.counters.errors
     assert errors["duplicate"] == 40
     assert errors["out_of_order"] == 100
-    assert errors["sequence_gap"] == 100 - 1  # each late one was missed before, save the one before the very first
+    assert errors["sequence_gap"] == 100 - 1  # each late one was missing first, except the one before the very first
     assert set(errors) == {"duplicate", "out_of_order", "sequence_gap"}
     clock = np.concatenate([record.rows for record in records if isinstance(record, DeviceClockSamples)])
     assert (np.diff(clock["device_time_ns"]) > 0).all()

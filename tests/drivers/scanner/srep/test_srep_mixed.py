@@ -74,7 +74,7 @@ class Reader:
         del kept["_scan_angle"]  # which never changes
         thinner, tracker = kept.pop("_thinner"), dict(vars(kept.pop("_tracker")))
         oldest = tracker["_last"].unwrapped - LATE_DATAGRAMS
-        tracker["_missing"] = {at for at in tracker["_missing"] if at >= oldest}  # of others nothing is asked
+        tracker["_missing"] = {at for at in tracker["_missing"] if at >= oldest}  # older numbers are never looked up
         return kept | tracker | {"thinner": thinner and vars(thinner), "told": self.told}
 
 

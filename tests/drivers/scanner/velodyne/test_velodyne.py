@@ -79,7 +79,7 @@ def test_points_agree_with_velodyne_decoder(name: str, total: int) -> None:
     np.testing.assert_allclose(np.linalg.norm(points, axis=1), np.linalg.norm(xyz(theirs), axis=1), atol=2e-5)
     np.testing.assert_allclose(points[:, 2], theirs["z"], atol=1e-4)
     azimuth = np.arctan2(points[:, 1], points[:, 0]) - np.arctan2(theirs["y"], theirs["x"])
-    assert np.degrees(np.abs(np.angle(np.exp(1j * azimuth))).max()) < 0.025  # it takes one speed a packet
+    assert np.degrees(np.abs(np.angle(np.exp(1j * azimuth))).max()) < 0.025  # theirs uses one speed per packet
     seconds = ours["device_time_ns"] * 1e-9
     np.testing.assert_allclose(seconds - seconds.min(), theirs["time"] - theirs["time"].min(), atol=1e-6)
 

@@ -141,7 +141,7 @@ def test_frames_arrive_in_order_with_kernel_timestamps(transport: PythonCanTrans
     for item in sent:
         bus.send(item)
     after_ns = time.time_ns()
-    time.sleep(0.05)  # a stamp of the read would fall after this
+    time.sleep(0.05)  # the time of the read would be later
     blocks = collect(transport, len(sent))
     assert frames(blocks) == [pack_frame(item) for item in sent]
     stamps = np.concatenate([block.kernel_realtime_ns for block in blocks])
@@ -499,7 +499,7 @@ def test_a_gateway_with_a_single_client_is_retried_until_it_is_free() -> None:
 
 def test_an_absent_gateway_is_contacted_once(caplog: pytest.LogCaptureFixture) -> None:
     with socket.socket() as nobody:
-        nobody.bind(("127.0.0.1", 0))  # and does not listen
+        nobody.bind(("127.0.0.1", 0))  # it does not listen
         port = nobody.getsockname()[1]
         transport = PythonCanTransport(parse_transport(f"can:socketcand:can0?host=127.0.0.1&port={port}"))
         with pytest.raises(TransportError, match="cannot open the CAN bus: Connection refused"):

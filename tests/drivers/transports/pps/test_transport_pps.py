@@ -285,11 +285,11 @@ def test_both_edges_are_read_from_the_kernel_structure() -> None:
 @pytest.mark.parametrize(
     ("before", "changes", "carrier", "expected"),
     [
-        (10, 11, True, ("assert", 5)),  # the line rose and stands
+        (10, 11, True, ("assert", 5)),  # the line rose and stayed high
         (11, 12, False, ("clear", 6)),
         (10, 12, False, ("assert", 5)),  # a short pulse: up and down again before the thread ran
         (10, 13, True, ("assert", 5)),
-        (10, 10, True, ("assert", 5)),  # a driver that counts later than it wakes
+        (10, 10, True, ("assert", 5)),  # a driver that wakes readers before it counts
     ],
 )
 def test_a_dcd_edge_is_timed_at_wake_up(before: int, changes: int, carrier: bool, expected: tuple[str, int]) -> None:
