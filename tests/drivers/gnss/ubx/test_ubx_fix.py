@@ -299,7 +299,7 @@ def test_the_imu_parser_returns_inertial_records_only() -> None:
 
 
 def encoded() -> bytes:
-    """Two seconds of messages of which no recording was available: attitude, sensors and a moving base."""
+    """Return two seconds of messages without a recording: attitude, sensors and a moving base."""
     zeros = ubx.NavPvat(*[0] * len(ubx.NavPvat._fields))
     pvat = zeros._replace(
         itow_ms=TOW_MS, year=2024, month=11, day=27, hour=11, minute=59, second=42, valid=7, flags=0xB9
