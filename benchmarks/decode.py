@@ -26,10 +26,12 @@ from fastcrc.crc64 import xz as crc64_xz
 from benchmarks.cpu_time import cpu_seconds
 from swath.daemon.system import keep_freed_memory
 from swath.drivers.captures.opening import read_candump, read_pcap
+from swath.drivers.driver import find_driver
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import GNSS_KINDS
 from swath.drivers.imu.canmod_gps import CanmodGpsParser
 from swath.drivers.imu.dbc.parser import DbcParser
+from swath.drivers.imu.vectornav import wire
 from swath.drivers.parser import DeviceSettings, Parser, ParserCounters
 from swath.drivers.scanner.hesai.heads import MODE_FIRST_LAST_STRONGEST, HesaiHead
 from swath.drivers.scanner.hesai.models import QT64, QT128, XT16, XT32, XT32M2X
@@ -48,6 +50,7 @@ from swath.georef.records import (
     IMU_DTYPE,
     RETURN_DTYPE,
     ByteRows,
+    Chunk,
     ChunkBatch,
     ImuSamples,
     Record,
@@ -440,6 +443,48 @@ def measure_framing(repeats: int) -> Iterator[Figure]:
     )
 
 
+def vectornav_stream(samples: int = 5000) -> bytes:
+    """Make messages of a sample each, as ``swath setup`` asks a unit for them."""
+    fields = {
+        **{(wire.TIME, number): wire.encode_field(wire.TIME, number, 5) for number in (0, 2, 4, 5)},
+        (wire.TIME, 3): wire.encode_field(wire.TIME, 3, 2443),
+        (wire.TIME, 9): wire.encode_field(wire.TIME, 9, 3),
+        **{(wire.IMU, number): wire.encode_field(wire.IMU, number, 0.1, 0.2, -9.8) for number in (2, 3)},
+        (wire.IMU, 4): wire.encode_field(wire.IMU, 4, 25.0),
+        (wire.IMU, 11): wire.encode_field(wire.IMU, 11, 0),
+    }
+    return wire.encode_frame(fields) * samples
+
+
+def measure_inertial(repeats: int) -> Iterator[Figure]:
+    """Measure framing and decoding of inertial units' streams in reads of 4 KiB."""
+    streams = {"VectorNav, 1 sample a message": ("vectornav", vectornav_stream())}
+    for name, protocol, file, times in (
+        ("MicroStrain recording", "microstrain", "microstrain/mip_data.bin.gz", 1),
+        ("sbgECom, made stream", "sbg-ecom", "sbg-ecom/made.bin.gz", 10),
+        ("NCOM, made stream", "oxts-ncom", "oxts-ncom/made.bin.gz", 10),
+    ):
+        streams[name] = protocol, gzip.decompress((FIXTURES / file).read_bytes()) * times
+    for name, (protocol, stream) in streams.items():
+        chunks = [
+            Chunk("imu/bench", at * 1000, stream[at : at + READ_BYTES]) for at in range(0, len(stream), READ_BYTES)
+        ]
+
+        def decode_stream(protocol: str = protocol, chunks: list[Chunk] = chunks) -> Parser:
+            parser = find_driver("imu", protocol).make_parser(DeviceSettings("imu/bench"))
+            for chunk in chunks:
+                parser.feed(chunk)
+            return parser
+
+        def least(stream: bytes = stream) -> None:
+            crc32(stream)
+            bytearray(stream)
+
+        size = decode_stream().counters.bytes_framed
+        limit = rate(least, size, repeats)
+        yield Figure(name, "bytes", rate(decode_stream, size, repeats), None, limit, "CRC-32 + copy of the stream")
+
+
 def main() -> None:
     """Measure and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -457,6 +502,7 @@ def main() -> None:
         measure_ouster,
         measure_can,
         measure_framing,
+        measure_inertial,
     ):
         for figure in measure(arguments.repeats):
             figures.append(figure)
