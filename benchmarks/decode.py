@@ -43,8 +43,8 @@ from swath.drivers.scanner.ouster.layout import LidarLayout
 from swath.drivers.scanner.ouster.parser import OusterParser
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.drivers.scanner.srep.parser import SrepParser
-from swath.drivers.scanner.velodyne.heads import VLP16, VLP32C, VLS128
-from swath.drivers.scanner.velodyne.parser import DATA_BYTES, MODE_DUAL, PACKET_DTYPE, VelodyneParser
+from swath.drivers.scanner.velodyne.heads import PACKET_BYTES, VLP16, VLP32C, VLS128
+from swath.drivers.scanner.velodyne.parser import MODE_DUAL, PACKET_DTYPE, VelodyneParser
 from swath.georef.records import (
     AIMED_RETURN_DTYPE,
     IMU_DTYPE,
@@ -256,7 +256,7 @@ def hesai_figure(name: str, head: HesaiHead, units: ByteRows, repeats: int) -> F
 def velodyne_units(name: str, step_us: float) -> ByteRows:
     """Return a recording's data packets, repeated several times with continuous time stamps."""
     packets = [unit.data for unit in read_pcap(FIXTURES / "velodyne" / name, port=2368)]
-    once = np.frombuffer(b"".join(packets), dtype=np.uint8).reshape(-1, DATA_BYTES)
+    once = np.frombuffer(b"".join(packets), dtype=np.uint8).reshape(-1, PACKET_BYTES)
     return with_stamps(np.tile(once, (max(1, 3600 // len(once)), 1)), step_us)
 
 

@@ -146,6 +146,8 @@ class Driver:
         wavelength_nm: a scanner's wavelength by its maker's data sheet; None: 1064, as in most airborne scanners.
         eight_bit_intensity: whether a scanner's intensities range from 0 to 255.
         past_hour: whether a scanner's device time counts from the last full hour of UTC.
+        bytes_per_s: the most that a device of this protocol sends, by its maker's data sheet; None: unknown, taken as
+            that of a large scanner for a scanner, and as little for others.
         startup: builds the messages that a device needs before a survey, in sending order, and raises
             `DriverSettingsError`; None where the device needs no such message.
     """
@@ -166,6 +168,7 @@ class Driver:
     wavelength_nm: float | None = None
     eight_bit_intensity: bool = False
     past_hour: bool = False
+    bytes_per_s: float | None = None
     startup: Callable[[DeviceSettings, StartupOptions], tuple[StartupMessage, ...]] | None = None
 
 

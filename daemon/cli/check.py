@@ -95,9 +95,10 @@ def _sources(config: Config) -> list[str]:
 
 def _print_reports(reports: list[Report]) -> None:
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
+
+    from swath.daemon.cli.progress import page_console
 
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for title in ("source", "protocol", "opens", "bytes", "records", "time", ""):
@@ -110,7 +111,7 @@ def _print_reports(reports: list[Report]) -> None:
             verdict = Text("wrong", style="red")
         opens = "yes" if report.opens else "no"
         table.add_row(report.source, report.protocol, opens, count, records, report.time, verdict)
-    console = Console()
+    console = page_console()
     console.print(table)
     for report in reports:
         for problem in report.problems:

@@ -41,9 +41,10 @@ def command(
 
 def _print_table(listed: list[dict[str, Any]]) -> None:
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
+
+    from swath.daemon.cli.progress import page_console
 
     table = Table(box=SIMPLE_HEAD, pad_edge=False)
     for title in ("kind", "protocol", "transports", ""):
@@ -57,4 +58,4 @@ def _print_table(listed: list[dict[str, Any]]) -> None:
         if row["needs"]:
             what.append("\nneeds " + ", ".join(row["needs"]), style="yellow")
         table.add_row(first, row["protocol"], ", ".join(row["transports"]), what)
-    Console().print(table)
+    page_console().print(table)

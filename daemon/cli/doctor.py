@@ -50,12 +50,13 @@ def command(
 
 
 def _print(findings: list[Finding]) -> None:
-    from rich.console import Console
     from rich.text import Text
+
+    from swath.daemon.cli.progress import page_console
 
     style = {"ok": "green", "note": "yellow", "wrong": "bold red"}
     width = max(len(finding.check) for finding in findings)
-    console = Console()
+    console = page_console()
     for finding in findings:
         line = Text(f"{finding.verdict:<6}", style=style[finding.verdict])
         line.append(f"{finding.check:<{width}}  {one_line(finding.text)}", style="default")

@@ -26,11 +26,10 @@ def command(
 ) -> None:
     """Show duration, counts, rates, gaps, losses, time status, events and damage of logs.
 
-    Exit code 1 when units are not accounted for or a part is missing, 4 when data is damaged.
+    Exit code 1 when units are not accounted for or a part is missing, 4 when data is damaged. An index that is
+    missing, as after a kill, is no damage.
     """
-    from rich.console import Console
-
-    from swath.daemon.cli.progress import progress_bar
+    from swath.daemon.cli.progress import page_console, progress_bar
     from swath.daemon.log.format import LogError
     from swath.daemon.log.reader import open_logs
     from swath.daemon.log.statistics import session_statistics
@@ -47,12 +46,12 @@ def command(
     if as_json:
         print(json.dumps({"sessions": found, "passed_over": passed_over}, indent=2))
     else:
-        console = Console()
+        console = page_console()
         for numbers in found:
             _print_session(console, numbers)
         for line in passed_over:
             console.print(f"[red]passed over: {_plain(line)}[/]", highlight=False)
-    if passed_over or any(numbers["damage"] for numbers in found):
+    if passed_over or any(_real_damage(numbers) for numbers in found):
         raise typer.Exit(int(ExitCode.DAMAGE))
     if any(numbers["missing_parts"] or _unaccounted(numbers) for numbers in found):
         raise typer.Exit(int(ExitCode.PROBLEM))
@@ -67,6 +66,10 @@ def _plain(text: object) -> str:
     from rich.markup import escape
 
     return escape(one_line(str(text)))
+
+
+def _real_damage(numbers: dict[str, Any]) -> list[dict[str, Any]]:
+    return [damage for damage in numbers["damage"] if not damage["index_only"]]
 
 
 def _unaccounted(numbers: dict[str, Any]) -> int:
@@ -111,7 +114,7 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
     without_status = [source for source, values in numbers["sources"].items() if not values["has_status"]]
     if without_status:
         console.print(f"no status of {_plain(', '.join(without_status))}: losses are unknown", highlight=False)
-    if numbers["missing_parts"] or numbers["damage"]:
+    if numbers["missing_parts"] or _real_damage(numbers):
         console.print("[red]incomplete: units in missing parts and damaged places are not counted above[/]")
     elif not unaccounted and not without_status:
         console.print("every unit is accounted for: units = written + lost_kernel + lost_queue + lost_write")
@@ -122,6 +125,10 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
         severity, origin, code, text = (_plain(event.get(key, "?")) for key in ("severity", "source", "code", "text"))
         console.print(f"  {severity}: {origin} {code}: {text}", highlight=False)
     for damage in numbers["damage"]:
+        if damage["index_only"]:
+            text = f"{damage['file']}: only its index is missing, as after a kill; swath recover writes it"
+            console.print(_plain(text), highlight=False)
+            continue
         messages = "" if damage["messages"] is None else f", {damage['messages']} messages"
         text = f"{damage['file']} at byte {damage['offset']}: {damage['length']} bytes, {damage['what']}{messages}"
         console.print(f"[red]damage: {_plain(text)}[/]", highlight=False)
@@ -130,8 +137,11 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
 
 
 def _print_trouble(console: Console, numbers: dict[str, Any]) -> None:
-    """Print the error counts that wires and controllers report themselves."""
+    """Print the error counts that wires and controllers report themselves, and what degrades the streams."""
     for source, values in numbers["sources"].items():
+        if values.get("degraded"):
+            faults = _plain(", ".join(values["degraded"]))
+            console.print(f"[red]{_plain(source)}: DEGRADED: {faults}[/]", highlight=False)
         if values["trouble"]:
             counts = ", ".join(f"{count:,} {key.replace('_', ' ')}" for key, count in values["trouble"].items())
             senders = f"; refused senders: {values['refused_senders']}" if values["refused_senders"] else ""

@@ -144,7 +144,7 @@ def _decoded(decoded: dict[str, Any] | None) -> str | None:
 
 def _disk(found: dict[str, Any]) -> str:
     rate, hours = found["bytes_per_s"] / 1e6, found["hours_left"]
-    left = "" if hours is None else f", {hours:,.1f} h left at this rate"
+    left = "" if hours is None else f", {hours:,.1f} h left at the highest rate of the last half hour"
     reserve = f", of which {found['reserve_bytes'] / 1e9:.1f} GB reserve" if found["reserve_bytes"] else ""
     return f"{rate:,.2f} MB/s; {found['free_bytes'] / 1e9:,.1f} GB free{reserve}{left}"
 

@@ -55,9 +55,7 @@ def command(
     `swath calibrate`. Exit code 1 when the flight would not determine boresight or range offset.
     """
     require_installed("swath plan-calibration", *PRINTED_PAGES)
-    from rich.console import Console
-
-    from swath.daemon.cli.progress import progress_bar
+    from swath.daemon.cli.progress import page_console, progress_bar
     from swath.daemon.processing.calibration.model import model_of
     from swath.daemon.processing.calibration.plan.page import require_picture
     from swath.daemon.processing.calibration.plan.run import PlanOptions, plan_calibration
@@ -80,7 +78,7 @@ def command(
     if as_json:
         print(json.dumps(_document(planned, picture), indent=2))
     else:
-        _print(Console(), planned, written)
+        _print(page_console(), planned, written)
     for line in warnings:
         print(one_line(f"swath: {line}"), file=sys.stderr)
     if planned.lacking:

@@ -5,6 +5,7 @@ Work that ends within `AFTER_S` writes no line, so that scripts read nothing but
 
 from __future__ import annotations
 
+import os
 import sys
 import threading
 import time
@@ -26,9 +27,20 @@ TICK_S = 0.5
 FROM_S = 2.0  # a phase has to last so long before its remaining time is estimated
 SLOWEST = 10.0  # of anything but bytes in a second; a lower rate says less than the percentage
 BAR_WIDTH = 24
+PAPER_COLUMNS = 1000  # of what no terminal shows: a file or a pipe cuts and folds nothing
 COMPILING = (
     "compiling for this computer: this takes a minute or more and happens once; swath warm-up does it beforehand"
 )
+
+
+def page_console() -> Console:
+    """Return the console for tables on stdout: as wide as the terminal, or where there is none as they need, unless
+    COLUMNS says otherwise.
+    """
+    from rich.console import Console
+
+    free = not sys.stdout.isatty() and not os.environ.get("COLUMNS", "").isdigit()
+    return Console(width=PAPER_COLUMNS) if free else Console()
 
 
 @dataclass(slots=True)

@@ -27,7 +27,8 @@ def command(
     """Check every CRC, save all intact data into LOG.recovered.mcap and report exactly what was lost.
 
     The log itself stays unchanged. In a directory, logs that are being recorded or were already recovered are left
-    out. Exit code 4 when damage was found, 3 when a log could not be recovered (the others still are).
+    out. Exit code 4 when damage was found (an index that a kill left missing is none), 3 when a log could not be
+    recovered (the others still are).
     """
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.log.format import LogError
@@ -56,7 +57,7 @@ def command(
         print("nothing to recover: every log is being recorded or was already recovered")
     if refused:
         raise UserError("\n".join(map(one_line, refused)), ExitCode.IO)
-    if not all(report.whole for report in reports):
+    if not all(report.index_only for report in reports):
         raise typer.Exit(int(ExitCode.DAMAGE))
 
 
@@ -86,6 +87,9 @@ def _print_report(report: RecoveryReport) -> None:
     count = sum(report.messages.values())
     if report.whole:
         print(f"{report.path}: intact, {report.chunks} chunks, {count} messages; nothing to do")
+        return
+    if report.index_only:
+        print(f"{report.path}: only its index was missing; {count} messages, all of them, saved in {report.recovered}")
         return
     lost = "" if report.messages_lost is None else f", {report.messages_lost} lost"
     print(f"{report.path}: {report.chunks} good chunks, {count} messages saved in {report.recovered}{lost}")

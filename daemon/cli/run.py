@@ -32,11 +32,10 @@ def command(
     """Record every byte of the sensors in CONFIG until SIGTERM or Ctrl-C; SIGHUP begins a new part of the log."""
     from swath.daemon.config import load_config
     from swath.daemon.config.findings import NO_SOURCE
-    from swath.daemon.errors import ExitCode, UserError
     from swath.daemon.recorder.run import record
 
     _log_to_stderr()
     loaded = load_config(config)
     if not any(loaded.device_tables()) and not loaded.pps:
-        raise UserError(f"{config}: {NO_SOURCE}", ExitCode.USAGE)
+        logging.getLogger("swath").warning("%s: %s", config, NO_SOURCE)
     raise typer.Exit(int(record(loaded, seconds)))

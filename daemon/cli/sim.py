@@ -117,9 +117,7 @@ def plan_(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
     """Draw a plan (lines, swaths, buildings, height profile, density, overlap) and print its figures as a table."""
-    from rich.console import Console
-
-    from swath.daemon.cli.progress import progress_bar
+    from swath.daemon.cli.progress import page_console, progress_bar
     from swath.daemon.processing.earlier_runs import refuse_existing
     from swath.daemon.processing.files import aside_folder
     from swath.daemon.simulate.plans import FlightOptions, draw
@@ -138,7 +136,7 @@ def plan_(
     if as_json:
         print(json.dumps({"picture": str(picture), "lines": rows[:-1], "total": rows[-1]}, indent=2))
         return
-    _print_lines(Console(), rows)
+    _print_lines(page_console(), rows)
     print(one_line(str(picture)))
 
 

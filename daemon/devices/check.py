@@ -396,7 +396,7 @@ def _time_problems(entry: DeviceEntry, heard: Heard) -> list[str]:
     rate = heard.imu_clock_rate
     if entry.kind == "imu" and rate is not None and not 1.0 / CLOCK_RATE_FACTOR < rate < CLOCK_RATE_FACTOR:
         return [f"its counter runs {rate:.3g} times as fast as time; check tick_hz"]
-    if entry.pps is None or entry.transport.kind == "gnss" or entry.kind not in ("imu", "scanner"):
+    if entry.pps is None or entry.transport.carrier is not None or entry.kind not in ("imu", "scanner"):
         return []
     if heard.sees_pps is False:
         return [f"does not see its PPS ({entry.pps})"]

@@ -16,6 +16,7 @@ from swath.daemon.log.claim import is_being_written
 from swath.daemon.log.directory import nearest_there
 from swath.daemon.log.host_clock import read_clock_discipline
 from swath.daemon.log.parts import read_sign
+from swath.drivers.driver import find_driver
 from swath.drivers.transports.can.bitrate import interface_bitrate
 from swath.drivers.transports.spec import TransportSpec
 from swath.drivers.transports.udp_port import DEFAULT_BUFFER_MB
@@ -71,6 +72,23 @@ def needed_modules(config: Config | None, specs: list[TransportSpec]) -> list[st
     return needed
 
 
+def highest_bytes_per_s(config: Config | None) -> float:
+    """Return the most that the configured devices send: by their drivers, and by the speed of serial ports."""
+    if config is None:
+        return disk.SCANNER_BYTES_PER_S + disk.OTHER_BYTES_PER_S
+    rate = disk.OTHER_BYTES_PER_S  # status, events and PPS
+    for entry in config.devices():
+        if entry.transport.carrier is not None:
+            continue
+        usual = disk.SCANNER_BYTES_PER_S if entry.kind == "scanner" else disk.OTHER_BYTES_PER_S
+        declared = find_driver(entry.kind, entry.protocol).bytes_per_s
+        most = usual if declared is None else declared
+        if entry.transport.kind == "serial":
+            most = min(most, int(entry.transport.options.get("baud", disk.USUAL_BAUD)) / disk.SERIAL_BITS_A_BYTE)
+        rate += most + (disk.AUXILIARY_BYTES_PER_S if entry.auxiliary is not None else 0.0)
+    return rate
+
+
 def _clock(tree: Tree) -> Iterator[Finding]:
     yield from clock.keepers(tree, read_clock_discipline())
     yield from clock.movement(*clock.watch())
@@ -80,8 +98,7 @@ def _disk(tree: Tree, config: Config | None, write: bool) -> Iterator[Finding]:
     directory = DEFAULT_DIRECTORY if config is None else Path(config.session.directory)
     reserve = DEFAULT_RESERVE_BYTES if config is None else config.session.reserve_mb * 1e6
     split = DEFAULT_SPLIT_BYTES if config is None else config.session.split_size_mb * 1e6
-    scanners = 1 if config is None else len(config.scanner)
-    rate = scanners * disk.SCANNER_BYTES_PER_S + disk.OTHER_BYTES_PER_S
+    rate = highest_bytes_per_s(config)
     there, permitted = nearest_there(directory)
     if not permitted:
         yield from disk.writable(tree, directory, devices.recording_user(tree))

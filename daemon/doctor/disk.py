@@ -15,8 +15,11 @@ from swath.daemon.doctor.finding import Finding, Tree, Verdict
 from swath.daemon.log.directory import nearest_there
 from swath.daemon.log.words import duration_text
 
-SCANNER_BYTES_PER_S = 25e6  # 20 000 datagrams of 1206 bytes
+SCANNER_BYTES_PER_S = 25e6  # of a scanner whose driver declares no rate: 20 000 datagrams of 1206 bytes
 OTHER_BYTES_PER_S = 0.2e6
+AUXILIARY_BYTES_PER_S = 0.5e6  # position packets of a head: at most 800 datagrams of 554 bytes
+SERIAL_BITS_A_BYTE = 10
+USUAL_BAUD = 115200  # of a transport that gives none
 LITTLE_ROOM_S = 3600.0
 TEST_BYTES = 64 << 20
 SYNC_WRONG_S = 2.0  # the queue holds 2.6 s of this scanner's data

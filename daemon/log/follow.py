@@ -5,6 +5,7 @@ It only reads files and holds one chunk in memory at a time; the recorder is not
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 from collections import Counter, deque
@@ -30,9 +31,31 @@ from swath.daemon.log.mcap.scan import (
 from swath.daemon.log.parts import Sign, read_sign
 
 EVENT_CHUNKS = 100  # latest chunks of a part whose events are shown for the time before following began
+GROWTH_STEP_NS = 10_000_000_000
+GROWTH_STEPS = 180  # half an hour
 _HEAD = struct.Struct("<BQ")
 _PEEK_BYTES = _HEAD.size + 16  # reaches a chunk's first and last time, and a message index's channel
 _EVENTS = "/events"
+
+
+class Growth:
+    """Counts the bytes of chunks by ten seconds of the log's time, over the last half hour."""
+
+    def __init__(self) -> None:
+        self._bytes: dict[int, int] = {}
+
+    def add(self, newest_ns: int, length: int) -> None:
+        """Add a chunk: the time of its newest message and its bytes."""
+        number = newest_ns // GROWTH_STEP_NS
+        self._bytes[number] = self._bytes.get(number, 0) + length
+        if len(self._bytes) > GROWTH_STEPS:
+            newest = max(self._bytes)
+            self._bytes = {at: size for at, size in self._bytes.items() if at > newest - GROWTH_STEPS}
+
+    def highest_bytes_per_s(self) -> float:
+        """Return the highest rate over ten seconds; 0 before the log spans whole ones."""
+        whole = sorted(self._bytes)[1:-1]
+        return max((self._bytes[at] for at in whole), default=0) / (GROWTH_STEP_NS * 1e-9)
 
 
 class PartFollower:
@@ -44,9 +67,10 @@ class PartFollower:
         ended: the data section is complete; nothing more will be written.
         damaged: number of chunks that could not be read.
         newest_ns: log time of the newest message so far.
+        growth: bytes of its chunks by time.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, growth: Growth | None = None) -> None:
         """Open the file and read the records before the first chunk.
 
         Raises:
@@ -58,6 +82,8 @@ class PartFollower:
         self.ended = False
         self.damaged = 0
         self.newest_ns: int | None = None
+        self.growth = Growth() if growth is None else growth
+        self._grown_to = 0
         self._channels: dict[int, ChannelSpec] = {}
         self._schemas: dict[int, records.Schema] = {}
         self._file = path.open("rb")
@@ -124,9 +150,25 @@ class PartFollower:
             opcode, length = head
             at, self._at = self._at, self._at + _HEAD.size + length
             if opcode == OP_CHUNK:
+                self._note_growth(at, length, self._pread(at, _PEEK_BYTES))
                 yield from self._chunk(at, length)
             elif opcode == OP_DATA_END:
                 self.ended = True
+
+    def _note_growth(self, at: int, length: int, peek: bytes) -> int:
+        """Count a chunk once; return the time of its newest message."""
+        newest_ns = int.from_bytes(peek[17:25], "little")
+        if at >= self._grown_to:
+            self._grown_to = at + length
+            self.growth.add(newest_ns, length)
+        return newest_ns
+
+    def read_growth(self) -> None:
+        """Go to the end and count the bytes of all chunks; the messages are not read."""
+        while (head := self._whole_record()) is not None and head[0] != OP_DATA_END:
+            if head[0] == OP_CHUNK:
+                self._note_growth(self._at, head[1], self._pread(self._at, _PEEK_BYTES))
+            self._at += _HEAD.size + head[1]
 
     def _chunk(self, at: int, length: int) -> Iterator[LogBatch]:
         try:
@@ -149,7 +191,7 @@ class PartFollower:
             opcode, length = head
             peek = self._pread(self._at, _PEEK_BYTES)
             if opcode == OP_CHUNK:
-                chunk_at, newest_ns = self._at, int.from_bytes(peek[17:25], "little")
+                chunk_at, newest_ns = self._at, self._note_growth(self._at, length, peek)
                 if events_id is None:
                     events_id = self._learn_events(self._at, length)
                 chunks.append((chunk_at, newest_ns))
@@ -178,6 +220,7 @@ class LogFollower:
     Attributes:
         part: the file being read; None if nothing has been recorded since following began.
         sign: content of the directory's ``recording.json``, which names the growing file; None if there is none.
+        growth: bytes written by time, over the last half hour.
     """
 
     def __init__(self, directory: Path, tail_s: float, *, every_part: bool = True) -> None:
@@ -190,6 +233,7 @@ class LogFollower:
         """
         self.part: PartFollower | None = None
         self.sign: Sign | None = None
+        self.growth = Growth()
         self._directory = directory
         self._tail_s = tail_s
         self._every_part = every_part
@@ -223,13 +267,22 @@ class LogFollower:
 
     def _open(self, path: Path, *, tail: bool) -> Iterator[LogBatch]:
         try:
-            part = PartFollower(path)
+            part = PartFollower(path, self.growth)
         except (LogError, OSError):
             return  # not yet begun, or already removed: the next poll decides
-        if self.part is not None:
+        if self.part is None:
+            self._read_growth_before(part)
+        else:
             self.part.close()
         self.part, self._waited = part, False
         yield from part.tail(self._tail_s) if tail else part.batches()
+
+    def _read_growth_before(self, part: PartFollower) -> None:
+        """Count the bytes of the part before the first one that is followed."""
+        with contextlib.suppress(LogError, OSError):
+            before = PartFollower(self._directory / f"{part.info.session_id}_{part.number - 1}.mcap", self.growth)
+            with contextlib.closing(before):
+                before.read_growth()
 
     def close(self) -> None:
         """Close the file that is being read."""

@@ -79,6 +79,11 @@ class RecoveryReport:
         return not self.damage
 
     @property
+    def index_only(self) -> bool:
+        """True if nothing but the index of the original is missing, or nothing at all."""
+        return all(damage.index_only for damage in self.damage)
+
+    @property
     def lost_bytes(self) -> int:
         """Number of bytes of the original that could not be read."""
         return sum(damage.length for damage in self.damage)
@@ -88,6 +93,7 @@ class RecoveryReport:
         return {
             "path": str(self.path),
             "whole": self.whole,
+            "index_only": self.index_only and not self.whole,
             "recovered": None if self.recovered is None else str(self.recovered),
             "chunks": self.chunks,
             "messages": dict(self.messages),

@@ -13,6 +13,7 @@ from swath.daemon.log.format import LogError, source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch, json_objects
 from swath.daemon.log.parsers import stored_config, stored_parsers
 from swath.daemon.log.reader import Session
+from swath.daemon.log.words import stream_faults
 from swath.drivers.parser import PacketParser, Parser
 from swath.georef.arrays import Int64Array
 from swath.georef.records import ChunkBatch, Record
@@ -75,6 +76,7 @@ class SourceNumbers:
     account_errors: int = 0
     miscounted: int = 0
     parser: Parser | None = None
+    second_port: bool = False
     records: Counter[str] = field(default_factory=Counter)
 
     def add(self, times_ns: Int64Array, units: Any) -> None:
@@ -121,8 +123,18 @@ class SourceNumbers:
             numbers["time_state"] = status.get("time_state")
             numbers["time_sigma_ns"] = status.get("time_sigma_ns")
             numbers["time_states"] = dict(self.time_states)
-        if self.parser is not None:
+        if self.second_port:  # what its parser counts is said once, at the first port
+            numbers["decoded"] = {
+                "messages": {},
+                "records": dict(self.records),
+                "bad_checksums": 0,
+                "bad_messages": 0,
+                "bytes_skipped": 0,
+                "errors": {},
+            }
+        elif self.parser is not None:
             counters = self.parser.counters
+            numbers["degraded"] = stream_faults(counters.errors, counters.messages.total(), duration_s)
             numbers["decoded"] = {
                 "messages": dict(counters.messages),
                 "records": dict(self.records),
@@ -175,7 +187,9 @@ def session_statistics(session: Session, *, decode: bool = True) -> dict[str, An
                 numbers.records[type(record).__name__] += record_count(record)
             if not source.endswith("/aux"):
                 troubles += parser_lines(source, numbers.parser)
-    complete = not session.missing_parts and not session.damage
+    for source, numbers in sources.items():
+        numbers.second_port = source.endswith("/aux") and _is_read(sources.get(source.removesuffix("/aux")))
+    complete = not session.missing_parts and all(entry.damage.index_only for entry in session.damage)
     if decode:
         troubles += _silent_antennas(attachments, sources)
     return {
@@ -201,11 +215,16 @@ def session_statistics(session: Session, *, decode: bool = True) -> dict[str, An
                 "length": entry.damage.length,
                 "what": entry.damage.what,
                 "messages": entry.damage.messages,
+                "index_only": entry.damage.index_only,
             }
             for entry in session.damage
         ],
         "notes": troubles,
     }
+
+
+def _is_read(numbers: SourceNumbers | None) -> bool:
+    return numbers is not None and numbers.parser is not None
 
 
 def record_count(record: Record) -> int:

@@ -5,6 +5,31 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 
+FAULTY_SHARE = 0.001  # of the messages; more restarts, incomplete, repeated or late ones degrade a source
+RESTART_EVERY_S = 60.0
+_FAULTS = (("_incomplete", "incomplete"), ("duplicate", "repeated"), ("out_of_order", "out of order"))
+
+
+def stream_faults(errors: Mapping[str, int], messages: int, seconds: float) -> list[str]:
+    """Describe what degrades a source's stream, in a few words each: more than one in a thousand of its messages is
+    incomplete, repeated or out of order, or its device restarts as often or once a minute.
+
+    Args:
+        errors: counts of its parser by code.
+        messages: number of its messages.
+        seconds: duration of the stream.
+    """
+    least = FAULTY_SHARE * max(messages, 1)
+    restarts = sum(count for code, count in errors.items() if code.endswith("restart"))
+    found = []
+    if restarts and (restarts > least or restarts * RESTART_EVERY_S >= seconds):
+        found.append(f"{restarts} restart{'s' if restarts > 1 else ''}")
+    for ending, words in _FAULTS:
+        count = sum(number for code, number in errors.items() if code.endswith(ending))
+        if count > least:
+            found.append(f"{count} {words} ({100.0 * count / max(messages, 1):.2g} % of its messages)")
+    return found
+
 
 def duration_text(seconds: float) -> str:
     """Format a duration as ``3 h 05 min``, ``12 min`` or ``40 s``."""

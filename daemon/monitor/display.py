@@ -133,8 +133,10 @@ class Monitor:
         now_ns = None if self._part is None else self._now_ns(self._part.info)
         why_not = self._why_not_recording(now_ns)
         sources = {} if now_ns is None else self._plain_sources(now_ns)
+        if why_not is not None:  # what they last did says nothing about now
+            sources = {source: _stale(values) for source, values in sources.items()}
         rate = sum(values["bytes_per_s"] or 0.0 for values in sources.values())
-        room = self._room(rate)
+        room = self._room(max(rate, self._follower.growth.highest_bytes_per_s()))
         troubles = self._troubles(sources, room) if why_not is None else [why_not]
         verdict = NOT_RECORDING if why_not is not None else DEGRADED if troubles else RECORDING
         found: dict[str, Any] = {
@@ -217,6 +219,12 @@ class Monitor:
         if hours is not None and hours * 3600 < LITTLE_LEFT_S:
             troubles.append(f"space for only {duration_text(hours * 3600)}")
         return list(filter(None, troubles))
+
+
+def _stale(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values of a source of which nothing is recorded now."""
+    kept = {key: value for key, value in values.items() if key not in ("time_state", "time_sigma_ns", "decoded")}
+    return kept | {"state": "stale", "rate_hz": None, "bytes_per_s": None}
 
 
 def _is_of_this_boot(boot_id: str) -> bool:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from swath.daemon.log.mcap.chunks import LogBatch
+from swath.daemon.log.words import stream_faults
 from swath.drivers.parser import DriverSettingsError, Parser
 from swath.georef.records import ChunkBatch
 
@@ -204,4 +205,5 @@ def decoded_trouble(decoded: dict[str, Any]) -> str:
         words.append(f"{decoded['bad']} of {decoded['bad'] + decoded['messages']} messages damaged")
     if decoded["gaps"]:
         words.append(f"{decoded['gaps']} missing in its sequence")
+    words += stream_faults(decoded["errors"], decoded["messages"], decoded["seconds"])
     return ", ".join(words)

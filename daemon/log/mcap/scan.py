@@ -67,6 +67,10 @@ class Record:
     body: bytes
 
 
+NO_INDEX = "the file is incomplete: its index and footer were never written"
+BAD_INDEX = "index and footer are missing, cut off or wrong"
+
+
 @dataclass(frozen=True, slots=True)
 class Damage:
     """A stretch of the file that could not be read.
@@ -81,6 +85,11 @@ class Damage:
     length: int
     what: str
     messages: int | None = None
+
+    @property
+    def index_only(self) -> bool:
+        """True if no message is lost: only the index and the footer, which follow from the messages."""
+        return self.what in (NO_INDEX, BAD_INDEX)
 
 
 def scan(
@@ -140,11 +149,11 @@ def _scan(file: BinaryIO, size: int, *, chunks: bool, wanted: ChannelFilter | No
                 return
             resumed = next_chunk(file, offset, size)
             if resumed is None:
-                yield Damage(offset, size - offset, "index and footer are missing, cut off or wrong")
+                yield Damage(offset, size - offset, BAD_INDEX)
                 return
             yield Damage(offset, resumed - offset, "unreadable bytes")
             offset = resumed
-    yield Damage(size, 0, "the file is incomplete: its index and footer were never written")
+    yield Damage(size, 0, NO_INDEX)
 
 
 def _joined(one: Damage, other: Damage) -> Damage:

@@ -382,6 +382,7 @@ DRIVERS = (
         tells_pps=False,
         needs=("installation", "geometry.file"),
         wavelength_nm=865.0,
+        bytes_per_s=42.3e6,  # 128 beams, dual return: 1280 packets a second of 33 024 bytes
     ),
 )
 

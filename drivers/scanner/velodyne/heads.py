@@ -12,6 +12,7 @@ from swath.georef.arrays import Int64Array
 
 BLOCKS = 12  # blocks of a data packet
 PLACES = 32  # places of a block
+PACKET_BYTES = 1206
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,11 @@ class SpinningHead:
     def groups(self, *, dual: bool) -> int:
         """Return the number of groups in a packet."""
         return BLOCKS // (len(self.block_flags) * (2 if dual else 1))
+
+    @property
+    def packet_bytes_per_ns(self) -> float:
+        """Bytes of data packets per nanosecond in dual return, the most that it sends."""
+        return PACKET_BYTES / (self.group_ns * self.groups(dual=True))
 
     def used_block_flags(self, *, dual: bool) -> NDArray[np.uint16]:
         """Return the flags of a packet's blocks, one for each block in use."""

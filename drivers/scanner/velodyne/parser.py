@@ -29,6 +29,7 @@ from swath.drivers.scanner.velodyne.calibration import read_calibration
 from swath.drivers.scanner.velodyne.heads import (
     BLOCKS,
     HDL32E,
+    PACKET_BYTES,
     PLACES,
     VLP16,
     VLP16_HIRES,
@@ -53,7 +54,6 @@ from swath.georef.records import (
 
 LATE_PACKETS = 16  # the network delays a packet by at most so many places; a larger step back is a clock change
 
-DATA_BYTES = 1206
 MODE_STRONGEST, MODE_LAST, MODE_DUAL = 0x37, 0x38, 0x39  # first factory byte, table 9-2
 RETURN_MODES = (MODE_STRONGEST, MODE_LAST, MODE_DUAL)
 SINGLE_FLAGS = {MODE_STRONGEST: RETURN_FLAG_STRONGEST, MODE_LAST: RETURN_FLAG_LAST}
@@ -133,13 +133,13 @@ class VelodyneParser(PacketParser):
         self.counters.bytes += units.size
         if units.shape[1] == POSITION_BYTES:
             return self._position.read(host_time_ns, units)
-        if units.shape[1] != DATA_BYTES:
+        if units.shape[1] != PACKET_BYTES:
             self._refuse("bad_length", len(units), units.shape[1])
             return []
         packets = units.view(PACKET_DTYPE)[:, 0]
         good = self._check(packets)
         self.counters.messages["data"] += int(good.sum())
-        self.counters.bytes_framed += int(good.sum()) * DATA_BYTES
+        self.counters.bytes_framed += int(good.sum()) * PACKET_BYTES
         if not good.all():
             host_time_ns, packets = host_time_ns[good], packets[good]
         fresh, turn = self._follow(packets)
@@ -187,7 +187,7 @@ class VelodyneParser(PacketParser):
             ("bad_return_mode", np.isin(mode, RETURN_MODES)),
             ("bad_azimuth", azimuths_right),
         ):
-            self._refuse(code, int((good & ~passes).sum()), DATA_BYTES)
+            self._refuse(code, int((good & ~passes).sum()), PACKET_BYTES)
             good &= passes
         return good
 
@@ -324,6 +324,7 @@ def _driver(protocol: str, head: SpinningHead) -> Driver:
         wavelength_nm=903.0,
         eight_bit_intensity=True,
         past_hour=True,
+        bytes_per_s=1e9 * head.packet_bytes_per_ns,
     )
 
 

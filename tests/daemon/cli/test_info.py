@@ -5,20 +5,26 @@ from __future__ import annotations
 import gzip
 import json
 import os
+import subprocess
+import sys
 import time
 import tty
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from swath.daemon.log.words import stream_faults
+from swath.drivers.captures.opening import read_pcap
 from swath.drivers.driver import find_driver
 from swath.drivers.gnss.nmea.sentences import encode_gga
 from swath.drivers.gnss.ubx.messages import RXM_RAWX, RxmRawx
 from swath.drivers.parser import DeviceSettings
+from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.georef.records import ChunkBatch
-from tests.daemon.builders import CAPTURE, INFO, write_part
-from tests.daemon.commands import swath
-from tests.daemon.exchange.builders import write_config, write_log
+from tests.daemon.builders import CAPTURE, INFO, START_NS, write_part
+from tests.daemon.commands import ROOT, swath
+from tests.daemon.exchange.builders import Unit, write_config, write_log
 from tests.daemon.rig import Recorder, session_table
 
 ROVER = '[gnss.rover]\ntransport = "serial:{path}?baud=921600"\nprotocol = "novatel"\n'
@@ -151,3 +157,56 @@ def test_long_names_and_wide_sigmas_fit_and_unknown_values_are_omitted(
     assert "57.7µs" in text
     assert "  ? mark: [x]\n" in text
     assert "scanner/left-front/aux: 2 bus off, 1,500 error frames" in text
+
+
+def test_a_head_s_errors_stand_once_and_repeated_datagrams_degrade_it(tmp_path: Path) -> None:
+    """Packets of a VLP-16's second port, whose length is wrong, go to the parser of its data."""
+    table = (
+        '[session]\nname = "n"\ndirectory = "logs"\n[scanner.roof]\ntransport = "udp:0.0.0.0:2368"\n'
+        'auxiliary = "udp:0.0.0.0:8308"\nprotocol = "velodyne-vlp16"\ninstallation_deg = [0, 0, 0]\n'
+        '[scanner.left]\ntransport = "udp:0.0.0.0:2369"\nprotocol = "srep"\nmirror_factor = 2\n'
+    )
+    packets = [unit.data for unit in read_pcap(ROOT / "fixtures/velodyne/mrpt_vlp16_gps.pcap.gz")]
+    data = [packet for packet in packets if len(packet) == 1206]
+    sent: list[Unit] = []
+    for number, packet in enumerate(data[:50]):
+        at = START_NS + number * 1_300_000
+        header = SrepHeader(sequence=number // 2, flags=1, pps_count=3, pps_ticks=1_000_000, first_ticks=1_500_000)
+        line = encode_datagram(header, np.arange(9) * 50, np.arange(9) * 100, np.full((9, 1), 9_000_000))
+        sent += [("scanner/roof", at, packet, None), ("scanner/roof/aux", at, bytes(99), None)]
+        sent.append(("scanner/left", at, line, None))
+    write_log(tmp_path / "logs", write_config(tmp_path, table), sent)
+    said = swath("info", str(tmp_path / "logs")).stdout
+    assert said.count("50 × bad_length") == 1, said
+    assert "scanner/left: DEGRADED: 25 repeated (" in said
+    (session,) = json.loads(swath("info", "--json", str(tmp_path / "logs")).stdout)["sessions"]
+    assert session["sources"]["scanner/roof/aux"]["decoded"]["errors"] == {}
+    assert session["sources"]["scanner/roof"]["degraded"] == []
+
+
+@pytest.mark.parametrize(
+    ("errors", "messages", "seconds", "said"),
+    [
+        ({"sample_incomplete": 10, "duplicate": 5, "out_of_order": 5}, 10_000, 100.0, []),
+        ({"sample_incomplete": 11}, 10_000, 100.0, ["11 incomplete (0.11 % of its messages)"]),
+        ({"sample_duplicate": 6, "duplicate": 6}, 10_000, 100.0, ["12 repeated (0.12 % of its messages)"]),
+        ({"out_of_order": 20}, 10_000, 100.0, ["20 out of order (0.2 % of its messages)"]),
+        ({"restart": 1}, 10_000, 3600.0, []),
+        ({"restart": 2}, 100_000, 100.0, ["2 restarts"]),
+        ({"restart": 1}, 100_000, 60.0, ["1 restart"]),
+        ({"restart": 1, "sequence_gap": 999}, 900, 3600.0, ["1 restart"]),
+        ({}, 0, 0.0, []),
+    ],
+)
+def test_restarts_and_faulty_messages_degrade_a_stream(
+    errors: dict[str, int], messages: int, seconds: float, said: list[str]
+) -> None:
+    assert stream_faults(errors, messages, seconds) == said
+
+
+def test_a_table_in_a_pipe_is_not_cut() -> None:
+    environment = {key: value for key, value in os.environ.items() if key != "COLUMNS"}
+    command = [sys.executable, "-m", "swath.daemon.cli.main", "devices"]
+    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    assert "…" not in run.stdout
+    assert max(map(len, run.stdout.splitlines())) > 80

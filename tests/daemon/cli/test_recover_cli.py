@@ -52,15 +52,30 @@ def test_a_complete_log_needs_no_recovery(logs: Path) -> None:
 def test_a_directory_is_recovered_and_the_originals_are_kept(logs: Path) -> None:
     before = {path.name: digest(path) for path in logs.iterdir()}
     result = swath("recover", "--json", "--background", str(logs))
-    assert result.returncode == 4, result.stderr
+    assert result.returncode == 0, "only the index was missing"
     whole, cut = json.loads(result.stdout)["logs"]
-    assert (whole["whole"], whole["recovered"]) == (True, None)
-    assert cut["whole"] is False
+    assert (whole["whole"], whole["recovered"], whole["index_only"]) == (True, None, False)
+    assert (cut["whole"], cut["index_only"]) == (False, True)
     copy = Path(cut["recovered"])
     assert copy == logs / CUT.replace(".mcap", ".recovered.mcap")
     assert official_counts(copy) == cut["messages"]
     assert cut["messages"]["/scanner/left/raw"] == 1200
     assert {name: digest(logs / name) for name in before} == before
+
+
+def test_a_log_without_its_index_is_read_and_recovered_without_a_fault(logs: Path) -> None:
+    (logs / WHOLE).unlink()
+    told = swath("info", str(logs))
+    assert told.returncode == 1, "part 0 is missing"
+    assert f"{CUT}: only its index is missing, as after a kill" in told.stdout
+    assert "damage: " not in told.stdout
+    result = swath("recover", str(logs))
+    assert result.returncode == 0
+    assert f"{CUT}: only its index was missing; " in result.stdout
+    cut = logs / CUT.replace("_1", "_2")
+    write_part(cut, part=2, finish=False)
+    cut.write_bytes(cut.read_bytes()[:-5])
+    assert swath("recover", str(cut)).returncode == 4, "a cut chunk is damage"
 
 
 def test_a_flipped_bit_costs_its_chunk_only(logs: Path) -> None:
@@ -78,7 +93,7 @@ def test_a_flipped_bit_costs_its_chunk_only(logs: Path) -> None:
 def test_recovered_copies_are_written_to_the_output_folder(logs: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     other.mkdir()
-    assert swath("recover", "--output", str(other), str(logs / CUT)).returncode == 4
+    assert swath("recover", "--output", str(other), str(logs / CUT)).returncode == 0
     assert [path.name for path in other.iterdir()] == [CUT.replace(".mcap", ".recovered.mcap")]
     assert sorted(path.name for path in logs.iterdir()) == [WHOLE, CUT]
 
@@ -102,7 +117,7 @@ def test_impossible_requests_are_refused_in_one_line(logs: Path, tmp_path: Path)
 
 
 def test_a_second_repair_does_not_overwrite_the_first(logs: Path) -> None:
-    assert swath("recover", str(logs / CUT)).returncode == 4
+    assert swath("recover", str(logs / CUT)).returncode == 0
     copy = logs / CUT.replace(".mcap", ".recovered.mcap")
     before = digest(copy)
     result = swath("recover", str(logs / CUT))
@@ -139,7 +154,7 @@ def test_a_log_under_recovery_by_another_process_is_skipped(logs: Path, recoveri
     assert result.stderr == f"swath: {logs / LARGE}: is being recovered by another process\n"
     recovering.send_signal(signal.SIGCONT)
     _, stderr = recovering.communicate(timeout=HANGS_S)
-    assert (recovering.returncode, stderr) == (4, "")
+    assert (recovering.returncode, stderr) == (0, "")
     assert official_counts(logs / LARGE.replace(".mcap", ".recovered.mcap"))["/scanner/left/raw"] == 1200 * 20
     assert not unfinished_copy(logs).exists()
 
@@ -148,7 +163,7 @@ def test_remains_of_a_killed_recovery_are_replaced(logs: Path, recovering: subpr
     recovering.kill()
     recovering.wait()
     assert unfinished_copy(logs).exists()
-    assert swath("recover", str(logs / LARGE)).returncode == 4
+    assert swath("recover", str(logs / LARGE)).returncode == 0
     assert official_counts(logs / LARGE.replace(".mcap", ".recovered.mcap"))["/scanner/left/raw"] == 1200 * 20
     assert not unfinished_copy(logs).exists()
 
@@ -185,7 +200,7 @@ def test_the_copy_has_the_owner_and_permissions_of_the_log(logs: Path, mode: int
     owner = (4711, 4712) if os.geteuid() == 0 else (os.geteuid(), os.getegid())
     os.chown(logs / CUT, *owner)
     (logs / CUT).chmod(mode)
-    assert swath("recover", str(logs / CUT)).returncode == 4
+    assert swath("recover", str(logs / CUT)).returncode == 0
     copy = (logs / CUT.replace(".mcap", ".recovered.mcap")).stat()
     assert (copy.st_uid, copy.st_gid, copy.st_mode & 0o777) == (*owner, mode)
 

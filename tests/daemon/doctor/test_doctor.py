@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from swath.daemon.config import parse_config
-from swath.daemon.doctor import _specs, clock, devices, disk, host, needed_modules
+from swath.daemon.doctor import _specs, clock, devices, disk, highest_bytes_per_s, host, needed_modules
 from swath.daemon.doctor.finding import Finding, Tree, Verdict
 from swath.daemon.log.host_clock import STA_UNSYNC, ClockDiscipline
 from tests.builders import ROOT, SYSTEMD
@@ -308,6 +308,20 @@ def test_free_space_is_given_in_hours(free: float, rate: float, verdict: str, to
     (found,) = disk.room(free, 512e6, rate)
     assert found.verdict == verdict
     assert told in found.text
+
+
+def test_the_rate_of_the_devices_is_that_of_their_drivers(tmp_path: Path) -> None:
+    head = '[scanner.l]\ntransport = "udp:0.0.0.0:2368"\nauxiliary = "udp:0.0.0.0:8308"\ninstallation_deg = [0, 0, 0]\n'
+    receiver = '[gnss.r]\ntransport = "serial:/dev/ttyS0?baud=115200"\nprotocol = "ubx"\n'
+
+    def rate(text: str) -> float:
+        return highest_bytes_per_s(parse_config(f'[session]\nname = "x"\n{text}', tmp_path / "a.toml"))
+
+    none = rate("")
+    vlp16 = rate(f'{head}protocol = "velodyne-vlp16"\n') - none
+    assert vlp16 == pytest.approx(2 * 754 * 1206 + 0.5e6, rel=1e-3), "dual return: 1508 packets a second, and positions"
+    assert rate(receiver) - none == 11_520
+    assert highest_bytes_per_s(None) == 25.2e6
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ import pytest
 from rich.console import Console
 
 from swath.daemon.cli.monitor import page, time_text
-from swath.daemon.log.follow import LogFollower, PartFollower
+from swath.daemon.log.follow import Growth, LogFollower, PartFollower
 from swath.daemon.log.mcap.encode import encode_block
 from swath.daemon.log.mcap.writer import PartWriter
 from swath.daemon.log.reader import open_logs
@@ -294,7 +294,7 @@ def test_the_log_of_another_computer_is_judged_by_its_growth(
         time.sleep(0.1)
     found = monitor.snapshot()
     monitor.close()
-    assert (found["verdict"], found["sentence"][:33]) == ("not recording", "NOT RECORDING: nothing has been w")
+    assert (found["verdict"], found["sentence"][:33]) == ("not recording", "NOT RECORDING: no data were writt")
 
 
 @pytest.mark.slow
@@ -310,6 +310,60 @@ def test_after_a_power_cut_and_restart_the_old_log_is_not_recording(tmp_path: Pa
     assert code == 2
     assert found["sentence"].startswith("NOT RECORDING: ")
     assert "(of another computer or before a restart) has not grown for 5 s" in found["sentence"]
+
+
+@pytest.mark.slow
+def test_after_a_kill_the_sources_are_stale(tmp_path: Path, logs: Path) -> None:
+    port = free_udp_port()
+    monitor = Monitor(logs)
+    with Recorder(tmp_path, session_table(logs) + scanner(port)) as recorder, srep_sender(port, 100.0):
+        recorder.wait_said("device_opened")
+
+        def receives() -> bool:
+            monitor.poll()
+            return bool(monitor.snapshot()["sources"].get("scanner/left", {}).get("state") == "receiving")
+
+        wait_until(receives, "the source is received")
+        recorder.kill()
+    monitor.poll()
+    found = monitor.snapshot()
+    monitor.close()
+    assert found["verdict"] == "not recording"
+    left = found["sources"]["scanner/left"]
+    assert (left["state"], left["rate_hz"], "time_state" in left) == ("stale", None, False)
+    written = io.StringIO()
+    Console(file=written, width=100).print(page(found))
+    assert "stale" in written.getvalue()
+    assert "receiving" not in written.getvalue()
+
+
+def test_the_room_left_goes_by_the_highest_rate_of_the_last_half_hour() -> None:
+    growth = Growth()
+    assert growth.highest_bytes_per_s() == 0.0
+    second_ns = 1_000_000_000
+    for second in range(100):  # 2 MB/s for ten seconds, then a slow stream
+        growth.add((1_000_000 + second) * second_ns, 2_000_000 if 20 <= second < 30 else 1000)
+    assert growth.highest_bytes_per_s() == 2_000_000
+    for second in range(100, 1790):
+        growth.add((1_000_000 + second) * second_ns, 1000)
+    assert growth.highest_bytes_per_s() == 2_000_000
+    for second in range(1790, 1900):
+        growth.add((1_000_000 + second) * second_ns, 1000)
+    assert growth.highest_bytes_per_s() == 1000
+
+
+def test_the_growth_of_a_log_is_that_of_its_chunks(tmp_path: Path) -> None:
+    """Read from the end or from the beginning, each chunk counts once."""
+    path = tmp_path / f"{INFO.session_id}_0.mcap"
+    write_part(path)
+    counted = []
+    for read in (PartFollower.batches, lambda part: part.tail(0.1), lambda part: part.read_growth() or ()):
+        follower = PartFollower(path)
+        list(read(follower))
+        counted.append(dict(follower.growth._bytes))
+        follower.close()
+    assert counted[0] == counted[1] == counted[2]
+    assert 0.5 < sum(counted[0].values()) / path.stat().st_size <= 1.0
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -527,7 +581,7 @@ def test_on_a_terminal_a_page_is_shown_until_ctrl_c(tmp_path: Path, logs: Path) 
         command = [sys.executable, "-m", "swath.daemon.cli.main", "monitor", str(logs)]
         process = subprocess.Popen(command, cwd=ROOT, stdout=secondary, stderr=subprocess.PIPE, env=environment)
         os.close(secondary)
-        wanted = (b"GB free", b"scanner/left", b"receiving", b"session_started", b"h left at this rate")
+        wanted = (b"GB free", b"scanner/left", b"receiving", b"session_started", b"h left at the highest")
         shown = b""
         deadline_s = time.monotonic() + HANGS_S
         while not all(words in shown for words in wanted) and time.monotonic() < deadline_s:
