@@ -69,7 +69,7 @@ def _plain(text: object) -> str:
 
 
 def _real_damage(numbers: dict[str, Any]) -> list[dict[str, Any]]:
-    return [damage for damage in numbers["damage"] if not damage["index_only"]]
+    return [damage for damage in numbers["damage"] if not damage.get("index_only")]
 
 
 def _unaccounted(numbers: dict[str, Any]) -> int:
@@ -125,7 +125,7 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
         severity, origin, code, text = (_plain(event.get(key, "?")) for key in ("severity", "source", "code", "text"))
         console.print(f"  {severity}: {origin} {code}: {text}", highlight=False)
     for damage in numbers["damage"]:
-        if damage["index_only"]:
+        if damage.get("index_only"):
             text = f"{damage['file']}: only its index is missing, as after a kill; swath recover writes it"
             console.print(_plain(text), highlight=False)
             continue
@@ -144,7 +144,7 @@ def _print_trouble(console: Console, numbers: dict[str, Any]) -> None:
             console.print(f"[red]{_plain(source)}: DEGRADED: {faults}[/]", highlight=False)
         if values["trouble"]:
             counts = ", ".join(f"{count:,} {key.replace('_', ' ')}" for key, count in values["trouble"].items())
-            senders = f"; refused senders: {values['refused_senders']}" if values["refused_senders"] else ""
+            senders = f"; refused senders: {values['refused_senders']}" if values.get("refused_senders") else ""
             console.print(f"[red]{_plain(source)}: {_plain(counts + senders)}[/]", highlight=False)
 
 

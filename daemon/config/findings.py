@@ -83,7 +83,7 @@ def _unseen_pps(config: Config) -> Iterator[str]:
             isinstance(table, CorrectionsConfig | GnssConfig | RawConfig)
             or table.pps is None
             or table.protocol == RAW
-            or table.transport.startswith(("gnss:", "imu:"))
+            or parse_transport(table.transport).carrier is not None
         ):
             continue
         way = _why_unseen(table, find_driver(kind, table.protocol).yields)
