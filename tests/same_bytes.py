@@ -211,7 +211,7 @@ def main() -> int:
         for flight in FLIGHTS:
             if flight.preset not in options.flights:
                 continue
-            # both in folders of one name, which products may hold
+            # both are in folders of the same name, which products may contain
             found = []
             place = Path(name) / flight.preset
             for commit in commits:

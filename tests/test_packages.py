@@ -57,7 +57,7 @@ class Place:
         subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder / "venv"], check=True)
         self.bin = folder / "venv/bin"
         (self.packages,) = (folder / "venv/lib").glob("python3*/site-packages")
-        # a path in a .pth file brings the packages there, but not what their own .pth files name: Swath as developed
+        # a .pth file's path adds its packages, but not the paths of their .pth files: Swath as a developer has it
         (self.packages / "needed.pth").write_text(sysconfig.get_path("purelib"))
 
     def pip(self, *arguments: str) -> None:

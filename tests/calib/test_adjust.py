@@ -50,7 +50,7 @@ def test_the_printed_adjustment_is_reproduced() -> None:
     printed_values = [0.003665169848263187, -0.006111363445060003, 0.0021017691137531266, 0.18402286108779703]
     printed_sigmas = [4.190375990579231e-06, 4.519601098956462e-06, 2.6157347643027155e-05, 0.021912635891225555]
     np.testing.assert_allclose(found.sigmas, printed_sigmas, rtol=2e-4)
-    # FORMULAS linearises at the adjusted observations: within a hundredth of a sigma
+    # FORMULAS linearise at the adjusted observations, so results agree within a hundredth of a sigma
     np.testing.assert_allclose((found.values - printed_values) / found.sigmas, 0.0, atol=1e-2)
     np.testing.assert_allclose((found.values - np.array(TRUTH)) / found.sigmas, 0.0, atol=3.0)
     assert found.redundancy == pytest.approx(1443.0, abs=1e-3)

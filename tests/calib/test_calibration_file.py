@@ -106,7 +106,7 @@ def test_a_written_calibration_is_read_back(calibration: Calibration, identity: 
     same(read, calibration, exactly=False)
     assert (read.id, read.method, read.header["scanner_serial"]) == (identity, "combined", serial)
     assert read.header["created"] == CREATED
-    # A file that was read is written as it was: not one digit moves by being handed on.
+    # A file that was read and written again is unchanged to the last digit.
     again = calibration_text(read, header)
     assert again == text
     same(read_calibration(again, "test"), read, exactly=True)

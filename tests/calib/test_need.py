@@ -51,7 +51,7 @@ def test_expected_point_errors_match_the_scatter_of_drawn_calibrations() -> None
             ((built.flight.place(swath, replace(calibration, parameters=one), at) - true) ** 2).sum(axis=1)
             for one in draws
         ]
-    # 300 draws of mainly one direction: their mean square is known to √(2 / 300)
+    # 300 draws, mainly in one direction, determine their mean square to √(2 / 300)
     assert of(built).left_m["left"] ** 2 == pytest.approx(np.mean(np.concatenate(squares)), rel=0.25)
 
 

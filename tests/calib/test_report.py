@@ -82,7 +82,7 @@ def test_verdict_names_undetermined_parameters(report: ReportInput) -> None:
     verdict = judge(sound(report, held=held))
     assert verdict.level is Level.GOOD
     assert verdict.sentence.endswith("Not determined by this flight: lever arm z.")
-    # A boresight angle that is not determined is a reason, and all three are the end of it.
+    # An undetermined boresight angle is a reason for care.
     pitch = FixedParameter("left", "phi_rad", "flat ground", "slopes along track", 1e-3)
     verdict = judge(sound(report, held=(pitch,)))
     assert verdict.level is Level.CARE

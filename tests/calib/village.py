@@ -71,7 +71,7 @@ from_m = [{x0}, {y0}]
 to_m = [{x1}, {y1}]
 height_m = {height}
 """
-# name, from, to, height: opposite, crossing and parallel ones, the last two higher
+# name, from, to, height: lines that are opposite, crossing and parallel; the last two are higher
 LINES = (
     ("east", (-300, 0), (300, 0), 850),
     ("west", (300, 60), (-300, 60), 850),
@@ -80,7 +80,7 @@ LINES = (
     ("high_west", (320, -60), (-320, -60), 1150),
     ("high_south", (-80, 320), (-80, -320), 1150),
 )
-# Options of `swath calibrate` that say how well the village's scanner is known beyond boresight and range offset
+# Options of `swath calibrate` that state how well the village's scanner is known apart from boresight and range offset
 KNOWN = (
     *("--fix", "range_scale_ppm,scan_angle_scale_ppm,scan_plane_tilt_deg,time_offset_us"),
     *("--prior", "range_scale_ppm=1", "--prior", "scan_angle_scale_ppm=2"),

@@ -101,7 +101,7 @@ def inputs_of(target: Target, seed: bytes, key: bytes, length: int) -> Iterator[
     data = seed
     for number in range(length):
         rng = random.Random(key + bytes([number]))
-        # a text that is broken is refused whatever else is changed in it
+        # a broken text is refused, whatever else is changed in it
         data = target.mutate(rng, seed if rng.random() < FROM_SEED else data)
         yield data
 

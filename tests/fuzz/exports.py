@@ -106,7 +106,7 @@ def _imports(target: str, place: Place) -> Target:
     def mutate(rng: random.Random, base: bytes) -> bytes:
         return changed_text(rng, base, words) if words else damage(rng, base, start=rng.choice((0, 60)))
 
-    # a read may be as large as a unit
+    # a read may be as long as a unit
     return Target(target, [seed], mutate, run, None, lambda size: (48 << 20) + 400 * size)
 
 

@@ -221,7 +221,7 @@ def _changed(rng: random.Random, kind: str, frame: bytes) -> bytes:
         return damage(rng, frame)
     if kind in ("nmea", "novatel-ascii"):
         return seal(_changed_sentence(rng, frame))
-    # what a frame is (identifier, time) stands in its head, so that part is spared mostly
+    # the head tells what a frame is (identifier, time), so it is changed rarely
     start = 2 if rng.random() < 0.15 else min(6, len(frame) - 1)
     return seal(damage(rng, frame, resize=rng.random() < 0.15, start=start))
 

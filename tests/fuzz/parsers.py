@@ -50,7 +50,7 @@ def _builder(driver: Driver, name: str, make: Callable[[DeviceSettings], Parser]
         first = parsers[0].parser if isinstance(parsers[0], ChosenRecords) else parsers[0]
         stream = isinstance(first, StreamParser)
         target = _stream_target if stream else _packet_target
-        # a copy, since reading a DBC takes longer than an input
+        # copied, because reading a DBC takes longer than an input
         return target(driver, name, lambda number: deepcopy(parsers[number % len(parsers)]), first)
 
     return build

@@ -40,7 +40,7 @@ def aimed(n: int, height_m: FloatArray, sensor_m: float, aside_deg: float) -> tu
 def test_heights_are_interpolated_bilinearly() -> None:
     height_m, rng = hills(), np.random.default_rng(1)
     row, column = rng.uniform(0, 159, 500), rng.uniform(0, 129, 500)
-    row[:2], column[:2] = (0, 159), (129, 0)  # corners too
+    row[:2], column[:2] = (0, 159), (129, 0)  # includes corners
     lat, lon = np.radians(FIRST_DEG[1] + STEP_DEG[1] * row), np.radians(FIRST_DEG[0] + STEP_DEG[0] * column)
     wanted = RegularGridInterpolator((np.arange(160), np.arange(130)), height_m)((row, column))
     inner = slice(2, None)

@@ -42,7 +42,7 @@ def test_a_kernel_changed_in_another_file_is_compiled_anew(tmp_path: Path) -> No
         (package / "inner.py").write_text(INNER.format(factor=factor))
         environment = os.environ | {
             "PYTHONPATH": str(tmp_path),
-            "PYTHONDONTWRITEBYTECODE": "1",  # Python takes a file as long as before and of the same second for the same
+            "PYTHONDONTWRITEBYTECODE": "1",  # Python would mistake a file of equal length and second for the same
             "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
         }
         command = [sys.executable, "-c", "import swath.georef.outer"]

@@ -113,7 +113,7 @@ def scan_angles(geometry: Geometry, installation: FloatArray, roll_rad: float, r
 def test_scan_angles_are_positive_to_the_right_however_the_head_is_mounted() -> None:
     readings = [-0.5, 0.0, 0.3]
     degrees = np.degrees(readings)
-    np.testing.assert_allclose(scan_angles(LINE, np.eye(3), 0.0, readings), degrees, atol=0.06)  # of a pitch of 3.4°
+    np.testing.assert_allclose(scan_angles(LINE, np.eye(3), 0.0, readings), degrees, atol=0.06)  # with a pitch of 3.4°
     np.testing.assert_allclose(scan_angles(LINE, TURNED, 0.0, readings), -degrees, atol=0.06)
 
 
@@ -215,7 +215,7 @@ def test_encoder_motion_is_used_only_with_an_encoder_latency(monkeypatch: pytest
     assert np.abs(points.points_map - ahead.points_map).max() < 1e-8
     assert motion.asked == 1
     Georeferencer(model(), encoder_motion=motion).georeference(rows, time_ns, flight())
-    assert motion.asked == 1  # nobody needs it
+    assert motion.asked == 1  # it is not needed
 
 
 def test_no_rows_give_no_points() -> None:

@@ -70,7 +70,7 @@ def test_a_trajectory_of_no_duration_has_no_strip(epochs: int) -> None:
 
 
 def test_laser_spans_separated_by_less_than_a_gap_are_joined() -> None:
-    first = np.array([30, 0, 10, 40]) * S  # two scanners' chunks stand in any order
+    first = np.array([30, 0, 10, 40]) * S  # chunks of two scanners have no common order
     last = np.array([40, 9.5, 20, 45]) * S
     assert laser_spans(first, last.astype(np.int64)) == [(0, 20 * S + 1), (30 * S, 45 * S + 1)]
 

@@ -183,7 +183,7 @@ def test_fixes_match_gpsd(tmp_path: Path, case: Case) -> None:
             assert fix.height_m == pytest.approx(tpv["altHAE"], rel=0, abs=case.metres)
         assert tpv.get("status", 1) == STATUS[fix.fix_type], tpv["time"]
     assert any("altHAE" in tpv for tpv in told)
-    # a client that comes after the first epochs misses them; gpsd tells an epoch when the next one begins
+    # a late client misses the first epochs; gpsd reports an epoch when the next one begins
     expected = {utc(fix) for fix in ours.values() if utc(fix) >= min(epochs)}
     assert expected - epochs <= {max(expected)}
     assert len(epochs) > len(ours) / 2

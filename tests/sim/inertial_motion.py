@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from swath.sim.flight.trajectory import Trajectory
 
 
-# Ten minutes and more: lines with turns to either side between them, and climbs, in rough air.
+# More than ten minutes: lines, turns to either side between them, and climbs, in rough air.
 ROUGH_PLAN = """
 [flight]
 name = "rough"

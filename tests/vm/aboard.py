@@ -24,7 +24,7 @@ TREE = Path(__file__).resolve().parents[2]
 WAIT_S = 400.0  # measures nothing: it ends what would never end
 SWATH = "/opt/swath/bin/swath"
 SETTINGS = "/usr/lib/sysctl.d/90-swath.conf"
-# its user, priority, limits and (no) capabilities are swathd.service's
+# user, priority, limits and (no) capabilities are those of swathd.service
 AS_THE_SERVICE = (
     *("prlimit", "--memlock=unlimited", "--rtprio=10", "--nofile=4096", "chrt", "-f", "10"),
     *("setpriv", "--reuid=swath", "--regid=swath", "--init-groups", "--no-new-privs"),

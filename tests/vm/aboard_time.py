@@ -182,7 +182,7 @@ def wall_clock(module: str) -> None:
     """Step the wall clock by an hour and back, slew it, and let the kernel insert a leap second."""
     sh(f"insmod {module} raw=1")
     lend("/dev/pps0")
-    # the receiver's UTC is a clock that nobody steps or slews, whose seconds are the pulses'
+    # the receiver's UTC follows a clock that is never stepped or slewed, and so do its pulses
     base_ns = round((time.time_ns() - raw_ns()) / NANO) * NANO
     steps = []
 

@@ -52,7 +52,7 @@ ExecStart=/bin/sh -c 'modprobe vcan; ip link add vcan0 type vcan; ip link set vc
 WantedBy=sysinit.target
 """
 
-# qemu: the wire from ttyS1 to a second port of the same machine, which the driver of PCI ports finds
+# qemu joins ttyS1 to a second serial port of the same machine, which the driver of PCI ports serves
 SENDING_PORT = "/dev/$(basename /sys/bus/pci/drivers/serial/0000*/tty/ttyS*)"
 
 

@@ -252,7 +252,7 @@ def start(
     board = "q35,usb=off,sata=off,smbus=off"
     computer = ["-M", board, "-smp", "2", "-m", str(memory_mb), "-display", "none", "-serial", "stdio"]
     fixed = ["-nodefaults", "-no-user-config", "-no-reboot", "-device", "virtio-rng-pci"]
-    # setpriv: the machine does not outlive a test run that is killed
+    # setpriv ends the machine if the test run is killed
     line = [
         *("setpriv", "--pdeathsig", "KILL", "qemu-system-x86_64"),
         *_accelerator(),

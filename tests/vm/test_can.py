@@ -65,7 +65,7 @@ def test_can_at_1_khz_is_recorded_without_loss_and_with_kernel_timestamps(tmp_pa
     stamps = np.array([time_ns for time_ns, _ in content.units["imu/main"]])
     stamps -= session.info.realtime_ns - session.info.monotonic_ns
     before, after = np.fromfile(tmp_path / "sent", np.int64).reshape(-1, 2).T
-    # the kernel stamps a frame within the very call that sends it; a read that collects frames for 16 ms does not
+    # the kernel stamps a frame during the call that sends it, but a read may collect frames for 16 ms
     outside = (stamps < before - CLOCKS_NS) | (stamps > after + CLOCKS_NS)
     assert not outside.any(), (np.count_nonzero(outside), (stamps - before)[outside][:9], (stamps - after)[outside][:9])
     assert last_status(content, "imu/main").get("stamp_ambiguous", 0) == 0
@@ -91,7 +91,7 @@ def test_can_fd_error_frames_and_an_interface_down_and_up_are_recorded(tmp_path:
     content = read_log(tmp_path / "logs")
     sent = [bytes.fromhex(frame) for frame in facts(tmp_path, "sent")["frames"]]
     recorded = units(content, "imu/main")
-    # the kernel marks an FD frame as one (CANFD_FDF), whatever its sender wrote there
+    # the kernel marks FD frames (CANFD_FDF), whatever the sender wrote there
     assert [_without_flags(frame) for frame in recorded] == [_without_flags(frame) for frame in sent]
     assert [len(frame) for frame in recorded] == [len(frame) for frame in sent]
     assert sum(int.from_bytes(frame[:4], "little") == ERROR | BUS_OFF for frame in recorded) == 1
@@ -112,7 +112,7 @@ def test_a_can_controller_recovers_from_bus_off_by_itself_and_on_request(tmp_pat
     recorded = units(content, "imu/main")
     identifiers = [int.from_bytes(frame[:4], "little") for frame in recorded]
     data = [frame for frame, identifier in zip(recorded, identifiers, strict=True) if not identifier & ERROR]
-    # nothing that was sent while it was off
+    # frames sent while it was off do not appear
     assert [frame.hex() for frame in data] == facts(tmp_path, "sent")["frames"]
     told = [identifier & ~ERROR for identifier in identifiers if identifier & ERROR]
     assert told == [CONTROLLER, BUS_OFF, RESTARTED, BUS_OFF, RESTARTED]

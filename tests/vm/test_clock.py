@@ -20,14 +20,14 @@ def test_a_clock_stepped_slewed_and_with_a_leap_second_gives_no_wrong_second(tmp
     clocks = [value for _, value in content.messages["/clock"]]
     offset_ns = clocks[0]["realtime_ns"] - clocks[0]["monotonic_ns"]
 
-    # every step was seen as one: four of an hour, one to before midnight, the leap second
+    # all steps were seen: four of an hour, one to before midnight, the leap second
     offsets = [clock["realtime_ns"] - clock["monotonic_ns"] for clock in clocks]
     jumps = [round((later - earlier) / SECOND_NS) for earlier, later in pairwise(offsets)]
     assert [jump for jump in jumps if jump][:4] == [3600, -3600, -3600, 3600]
     assert [jump for jump in jumps if jump][5:] == [-1]
     assert len(content.events("wall_clock_stepped")) >= 6
 
-    # no wrong second, by a receiver and pulses that nothing steps
+    # by a receiver and pulses that are never stepped, no second is wrong
     moments = labelled(tmp_path / "logs")
     assert wrong_seconds(moments, lambda moment: moment.raw_ns + told["base_ns"]) == []
     assert sum(moment.state == "LOCKED" for moment in moments) > 200

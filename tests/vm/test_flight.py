@@ -219,7 +219,7 @@ def flown(folder: Path, seconds: float) -> Iterator[tuple[machine.Machine, Lines
                 lines.connect()
                 _, trouble = flying.communicate(timeout=HANGS_S)
                 assert flying.returncode == 0, trouble
-                # beside what fails: for a recorder that stood still, it says where each thread stood
+                # printed with a failure: it shows where each thread of a stalled recorder stood
                 sys.stdout.write(computer.told("journalctl -b -o short-monotonic -u swathd --no-pager", 200))
                 computer.told("sleep 3; systemctl stop swathd; sync", 200)
                 yield computer, lines
@@ -239,7 +239,7 @@ def test_a_flight_is_recorded_from_the_wires_and_georeferenced(
     assert run_app(["sim", "fly", str(tmp_path / "plan.toml"), "-o", str(again), "--seconds", f"{seconds:g}"]) == 0
     assert_complete(logs, again)
     out = tmp_path / "points"
-    # a nominal calibration's metres of sigma would hide any error of time, navigation and decoding
+    # a nominal calibration has sigmas of metres, which would hide errors of time, navigation and decoding
     known = ["--calibration", f"left={again / 'left.true.toml'}", "--trajectory-datum", "same"]
     assert run_app(["georef", str(logs), "-o", str(out), "--strips", "whole", *known]) in (0, 1)
     las = laspy.read(next(out.glob("*.laz")))

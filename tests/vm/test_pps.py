@@ -24,14 +24,14 @@ def test_pps_seconds_are_never_wrong_whatever_happens_to_the_edges(tmp_path: Pat
     moments = labelled(logs)
     assert sum(moment.state == "LOCKED" for moment in moments) > 200
     assert wrong_seconds(moments, lambda moment: moment.monotonic_ns + told["utc_minus_monotonic_ns"]) == []
-    # what the recorder itself said
+    # the recorder's own messages
     assert "HOLDOVER" in states_between(logs, told["lost"] + 6 * SECOND_NS, told["back"])
     assert "LOCKED" in states_between(logs, told["back"] + 2 * SECOND_NS, told["gone"])
     assert "HOLDOVER" in states_between(logs, told["gone"] + 6 * SECOND_NS, told["returned"])
     assert "LOCKED" in states_between(logs, told["returned"] + 2 * SECOND_NS, told["end"])
     assert [event["source"] for event in content.events("device_lost")] == ["pps/main"]
     assert len([event for event in content.events("device_opened") if event["source"] == "pps/main"]) == 2
-    # the kernel stamped: an edge is never where a sleeping reader would have put it
+    # edges have the kernel's stamps, not those of a reader that slept
     edges = [value for _, value in content.messages["/pps/main"]]
     offsets = sorted(min(edge["realtime_ns"] % SECOND_NS, -edge["realtime_ns"] % SECOND_NS) for edge in edges)
     assert offsets[len(offsets) // 2] < 5_000_000

@@ -250,7 +250,7 @@ def test_killing_the_live_service_repeatedly_does_not_affect_the_log(service: Ma
         begun = f"until read -r of <{processes}; do sleep 0.1; done; sleep {moments.uniform(0, 3):.2f}"
         gone = f'while read -r now <{processes} && [ "$now" = "$of" ]; do sleep 0.1; done'
         service.told(f"{begun}; {kill}; {gone}", COMES_BACK_S)
-    # each second one was its warm-up, whose end the unit ignores and systemd does not tell
+    # each second kill hits the warm-up, whose end the unit ignores and systemd does not report
     service.until(f"[ $({killed}) = {before + KILLS // 2} ]")
     assert shown(service, "MainPID") == pid
     assert newest_log(service) == first

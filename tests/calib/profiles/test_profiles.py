@@ -98,7 +98,7 @@ def test_each_single_error_is_found(parameter: str, kind: str, sign: float, rear
     found = survey(village(lines, rear=rear, **{parameter: size}), kind, CONTROL).profiles
     assert found
     for profile in found:
-        # the trajectory is the true one: what is left is noise, and what a large error changes elsewhere
+        # On the true trajectory only noise is left, and what a large error of one kind changes in another.
         assert abs(profile.found - size) < 3.0 * profile.noise_sigma + 0.01 * abs(size)
         assert abs(profile.found - size) < profile.sigma
         assert np.sign(profile.separation_m) == sign
@@ -317,7 +317,7 @@ def test_the_report_shows_a_range_section_before_and_after() -> None:
         before, after = draw(shown).axes
         heights = [np.asarray(axes.collections[0].get_offsets())[:, 1] for axes in (before, after)]
         assert len(heights[0]) == len(heights[1]) > 1
-        # along the vertical a range error counts by the cosine of the beam, 24° from it at most here
+        # along the vertical a range error counts by the cosine of the beam's angle, at most 24° here
         assert (heights[0] > 1.37 * 0.9).all()
         assert (heights[0] < 1.37 * 1.01 + 0.05).all()
         np.testing.assert_allclose(heights[1], left_m * heights[0] / 1.37, atol=0.05)

@@ -35,7 +35,7 @@ from tests.calib.made_outcome import Outcome
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
-# As the dictionary has them: class, then attributes that are mandatory.
+# Taken from the dictionary: class, then its mandatory attributes.
 MANDATORY = {
     "CA_CalibrationValidation": "calibrationType",
     "CA_LidarCalibrationTestfield": "lidarNObjectPoints lidarObjectPoint lidarJPlane lidarPlaneParameters",
@@ -70,7 +70,7 @@ def test_mandatory_attributes_are_present_or_listed_as_missing(outcome: Outcome)
     assert KEYS == {row.key for row in ROWS if row.obligation == "M"}
     assert KEYS <= record.values.keys() | set(record.missing)
     assert not record.values.keys() & set(record.missing)
-    # What no flight can tell is not made up.
+    # No value is invented that a flight cannot supply.
     assert {
         "CA_GNSS.numberSatellites",
         "SD_Calibration.calibrationAgency",
@@ -172,7 +172,7 @@ def test_large_matrices_are_mentioned_and_attached(outcome: Outcome) -> None:
     assert table.shape == (int(flat[f"{key}.matrix.rows"]), 16)
     assert float(flat[f"{key}.matrix.rms"]) == pytest.approx(float(np.sqrt(np.mean(table**2))), rel=1e-12)
     assert flat["CA_LidarCalibrationTestfield.lidarNObjectPoints"] == [str(len(table))]
-    # Small ones stand in the record whole.
+    # Small matrices are in the record completely.
     assert len(flat["CA_LidarCalComputation.corrections1.rows"][0]) == len(outcome.adjusted.names)
 
 
@@ -205,7 +205,7 @@ def test_matrices_equal_the_derivatives_of_the_sensor_model(outcome: Outcome) ->
     assert arrays["designMatrixObservations"][0, 6] == pytest.approx(
         (off(calibration, longer) - off(calibration, rows)) / 0.01, abs=1e-5
     )
-    # v of range and angle together close the misclosure: B v = e.
+    # Residuals v of range and angle close the misclosure: B v = e.
     share = float(np.sum(arrays["designMatrixObservations"][0, 6:] ** 2 * [0.02**2, 2e-5**2])) / group.sigma_m[row] ** 2
     closed = float(arrays["designMatrixObservations"][0] @ arrays["residuals"][0])
     assert closed == pytest.approx(group.misclosure_m[row] * share, rel=1e-9)

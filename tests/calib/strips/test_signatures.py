@@ -84,7 +84,7 @@ def test_columns_match_the_sensor_model(made: Cast, mounting: str) -> None:
     by_model = {"roll": 0, "pitch": 1, "heading": 2, "torsion": 6, "time": 11, "range": 3}
     for name, column in by_model.items():
         assert columns[:, NAMES.index(name)] == pytest.approx(from_model[:, column], rel=2e-3, abs=0.2)
-    # θ̇ τ moves a beam as a roll of −θ̇ τ does, of a head that looks ahead
+    # in a head that looks ahead, θ̇ τ moves a beam as a roll of −θ̇ τ does
     latency = -7.0 * math.copysign(1.0, head.start.installation_matrix[0, 0]) * columns[:, NAMES.index("roll")]
     assert columns[:, NAMES.index("scan direction")] == pytest.approx(latency, rel=1e-2, abs=30.0)
     assert errors[:, 3:] == pytest.approx(columns[:, :3])

@@ -271,7 +271,7 @@ def test_an_error_of_the_minimal_detectable_size_is_found_at_the_stated_rate(
         for _ in range(runs):
             value = factor @ draws.standard_normal(len(rows)) + smallest[name] * column
             found += not distance_tests(replace(rows, value_m=value))[3].passed
-        # at least so: an error that looks like another parameter's is found by that one's test, too
+        # at least, because a parameter's error is also detected by the test of a similar parameter
         assert POWER - 3.3 * np.sqrt(POWER * (1.0 - POWER) / runs) < found / runs < 0.95
 
 

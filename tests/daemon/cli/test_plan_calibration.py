@@ -134,9 +134,9 @@ def test_sigmas_follow_the_expected_trajectory_accuracy(tmp_path: Path, capsys: 
 @pytest.mark.parametrize(
     ("noise", "worse"),
     [
-        # gyroscopes walk: all attitude is worse, heading too
+        # more gyroscope noise makes all angles worse, heading included
         ("angle_random_walk_deg_per_sqrt_h = 0.3", {"omega_deg": 1.5, "phi_deg": 1.5, "kappa_deg": 1.5}),
-        # leaning gyroscopes look like pitch after a turn
+        # misaligned gyroscopes look like pitch after a turn
         ("misalignment_mrad = 1.0", {"phi_deg": 1.5}),
     ],
 )

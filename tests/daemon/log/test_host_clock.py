@@ -56,7 +56,7 @@ def test_a_batch_across_a_step_uses_both_offsets(converter: StampConverter, step
         assert times.tolist() == [host(1.2), host(1.4)]
         assert converter.ambiguous == 0
     else:
-        # 60 µs fit both ways into a batch of half a second: the read time is taken, and counted.
+        # within half a second, 60 µs fit both ways: the read time is used and counted.
         assert times.tolist() == [host(1.5), host(1.5)]
         assert converter.ambiguous == 2
     later = np.array([host(1.7) + step_ns], dtype=np.int64)

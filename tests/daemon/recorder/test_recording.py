@@ -71,7 +71,7 @@ def test_units_have_the_kernel_timestamps(tmp_path: Path, logs: Path, sender: so
         sent.append(time.time_ns())
         recorder.stop()
     times = [time_ns for time_ns, _ in read_log(logs).units["scanner/left"]]
-    # loopback delivers inside the send call: the stamp lies between this send and the next, whenever it was read
+    # loopback delivers within the send call, so a stamp lies between this send and the next
     spans = list(zip(times, pairwise(sent), strict=True))
     assert all(this - 1_000_000 <= time_ns < following for time_ns, (this, following) in spans), spans
 

@@ -62,7 +62,7 @@ def test_a_wall_clock_step_of_an_hour_does_not_affect_the_recording(tmp_path: Pa
     clocks = [value for _, value in content.messages["/clock"]]
     start_ns = clocks[0]["realtime_ns"] - clocks[0]["monotonic_ns"]
     spans = [(time_ns - start_ns, *span) for time_ns, span in zip(times, sent_ns, strict=True)]
-    # loopback delivers within the send call, however long a busy machine makes it; the clocks' rates differ a little
+    # loopback delivers within the send call, even on a busy machine; the clocks' rates differ a little
     assert all(before - 1_000_000 < stamp < after + 1_000_000 for stamp, before, after in spans), spans
     assert len(content.events("wall_clock_stepped")) == 2
     assert content.messages["/status/scanner/left"][-1][1]["stamp_ambiguous"] == 0

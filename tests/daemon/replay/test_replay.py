@@ -27,7 +27,7 @@ from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, se
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("replay")]  # one worker records once what is replayed
 SECONDS = 18
-# LOCKED after the table's end, too
+# it is LOCKED after the table's end too
 TIMED = ROVER_CONFIG.replace('protocol = "nmea"', 'protocol = "nmea"\nleap_seconds = 18')
 BUS = '[imu.main]\ntransport = "can:udp_multicast:239.74.163.2?port={port}"\nprotocol = "canmod-gps"\n'
 
@@ -133,12 +133,12 @@ def test_a_second_recorder_gets_the_same_bytes_edges_and_seconds(
     edges = [[value["edge_time_ns"] for _, value in log.messages["/pps/main"]] for log in (before, after)]
     assert len(edges[1]) == SECONDS
     steps = [[late - early for early, late in pairwise(times)] for times in edges]
-    # a stamp follows the wall clock, which may be slewed by 500 ppm; the writer's own rounding is a nanosecond
+    # a stamp follows the wall clock, which may be slewed by 500 ppm; the writer rounds to a nanosecond
     assert all(abs(new - old) < 1_000_000 for old, new in zip(*steps, strict=True)), steps
     assert time_states(before)[-1] == time_states(after)[-1] == "LOCKED"
     known = [log.events("second_known") for log in (before, after)]
     assert [[event["text"] for event in events] for events in known] == [["by gnss/rover ZDA"]] * 2
-    # the sentence that names a second comes as long after its edge as it did, but where the machine was busy for once
+    # a sentence has the same delay after its edge as in the recording, unless the machine was busy
     delays = [arrival_after_edge(log) for log in (before, after)]
     later = [abs(new - old) for old, new in zip(*delays, strict=True)]
     assert median(later) < 0.1, delays

@@ -37,7 +37,7 @@ FOLDER = FIXTURES / "vectornav"
 IMU_FILE, GNSS_FILE, DYNAMIC_FILE = "FixedSize_vn310-imu", "FixedSize_vn310-gnss", "DynamicSize_vn310-gnss"
 SATELLITES = ("SatInfo", "RawMeas")  # fields that the driver skips by their length
 GROUPS = {"Time": "", "IMU": "", "Att": "", "INS": "", "GNSS1": "gnss1.", "GNSS2": "gnss2."}
-# column of INSTINCT -> name here, where it is not the same in small letters
+# column of INSTINCT -> name here, if it differs by more than capitals
 NAMES = {
     **{"UTC": "utc", "TimeUTC": "utc", "GpsTow": "gps_tow", "GpsWeek": "gps_week", "SyncInCnt": "sync_in_count"},
     **{"SyncOutCnt": "sync_out_count", "TimeGps": "time_gps", "TimeGpsPps": "time_gps_pps", "Temp": "temperature"},
@@ -156,7 +156,7 @@ def test_increments_are_divided_by_their_own_interval() -> None:
     angle = [radians(float(row[head.index("IMU::DeltaTheta::Y [deg]")])) for row in rows]
     interval = [float(row[head.index("IMU::DeltaTime [s]")]) for row in rows]
     np.testing.assert_allclose(increments["angular_rate_b"][:, 1], np.divide(angle, interval), rtol=1e-6)
-    # both are the motion of a unit that lies still, with gravity in it
+    # both are the motion of a unit at rest, including gravity
     np.testing.assert_allclose(increments["specific_force_b"], rates["specific_force_b"], atol=0.06)
     np.testing.assert_allclose(increments["angular_rate_b"], rates["angular_rate_b"], atol=0.02)
 

@@ -90,7 +90,7 @@ def test_sensitivities_match_the_formula_sheet() -> None:
         return float(group_refractivity_ppm(1064.0, temperature_c + 273.15, pressure_hpa, vapour_hpa))
 
     assert (at(temperature_c=15.01) - at(temperature_c=14.99)) / 0.02 == pytest.approx(-0.9592, abs=5e-5)
-    assert at() / 1013.25 == pytest.approx(0.2728, abs=5e-5)  # the sheet's dN/dP, which leaves vapour out
+    assert at() / 1013.25 == pytest.approx(0.2728, abs=5e-5)  # the sheet's dN/dP, without water vapour
     assert at(pressure_hpa=1013.75) - at(pressure_hpa=1012.75) == pytest.approx(0.273, abs=5e-4)
     assert at(vapour_hpa=10.5) - at(vapour_hpa=9.5) == pytest.approx(-0.03911, abs=5e-6)
 
@@ -115,7 +115,7 @@ def test_air_through_a_measurement_reproduces_it(known_m: float) -> None:
 
 
 def test_path_means_match_the_formula_sheet() -> None:
-    # the sheet's air is that of NGA Eq. 10 and 11
+    # the sheet uses the air of NGA Eq. 10 and 11
     table = _table(lambda height_m: 1e-6 * group_refractivity_ppm(1064.0, *layer_air(height_m), 0.0))
     out = np.empty(4)
     means(table, np.array([3000.0, 3000.0, 200.0, 1600.0]), np.array([200.0, 3000.0, 200.0, 1600.0]), out)
@@ -241,7 +241,7 @@ def test_ardc_bending_matches_the_formula_sheet() -> None:
 def test_ardc_bending_follows_its_formula() -> None:
     origin, points, down = beams(300, up_to_m=4000.0)
     ground_m = heights(points)
-    keep = (ground_m > 0.0) & (lengths(points - origin) > 1000.0)  # nearer, a rounding is more than 1e-9 rad
+    keep = (ground_m > 0.0) & (lengths(points - origin) > 1000.0)  # at less, rounding exceeds 1e-9 rad
     origin, points, down = origin[keep], points[keep], down[keep]
     along = (points - origin) / lengths(points - origin)[:, np.newaxis]
     tan = np.tan(np.arccos(np.einsum("ni,ni->n", along, down)))
@@ -255,14 +255,14 @@ def test_ardc_bending_follows_its_formula() -> None:
 
 @pytest.mark.parametrize(("sensor_m", "ground_m"), [(400.0, 0.0), (3000.0, 200.0), (6000.0, -100.0), (10_000.0, 500.0)])
 def test_layer_bending_equals_the_exact_integral(sensor_m: float, ground_m: float) -> None:
-    # where the beam lands is told by Eq. 6 to 8, how far that is by the triangle with the earth's centre
+    # Eq. 6 to 8 give the place where the beam lands; the triangle with the earth's centre gives its distance
     constant = layer_constant_ppm(1064.0)
     nadir = np.radians([0.5, 10.0, 30.0, 45.0, 60.0, 70.0, 75.0 if sensor_m < 9000.0 else 70.0])
     wanted = spherical_bending(nadir, sensor_m, ground_m, constant)
     chord = nadir - wanted
     top, bottom = SPHERE_M + sensor_m, SPHERE_M + ground_m
     range_m = top * np.cos(chord) - np.sqrt(bottom**2 - (top * np.sin(chord)) ** 2)
-    # on the ellipsoid the sphere's curvature is met where the mean radius is the same
+    # on the ellipsoid, the place is one where the mean radius equals the sphere's
     lat = brentq(lambda lat: 6_356_752.314245 / (1 - 0.00669437999014 * np.sin(lat) ** 2) - SPHERE_M, 0.3, 1.0)
     origin = np.array([TO_E.transform(0.0, np.degrees(lat), sensor_m)] * len(nadir))
     down = np.array([-np.cos(lat), 0.0, -np.sin(lat)])
@@ -275,14 +275,14 @@ def test_layer_bending_equals_the_exact_integral(sensor_m: float, ground_m: floa
 def test_ardc_refuses_points_below_sea_level() -> None:
     origin = np.array([[6_378_137.0 + 2000.0, 0.0, 0.0], [6_378_137.0 - 100.0, 0.0, 0.0]])
     direction = np.array([-np.cos(0.5), np.sin(0.5), 0.0])
-    points = origin + np.array([[2400.0 / np.cos(0.5)], [300.0]]) * direction  # to 400 m below; all below
+    points = origin + np.array([[2400.0 / np.cos(0.5)], [300.0]]) * direction  # from 2000 m to −400 m; and below 0 m
     got = bent_by(Air(refraction="ardc"), origin, points, np.tile([-1.0, 0.0, 0.0], (2, 1)))
     assert got[0] == pytest.approx(float(ardc_k(2000.0, 0.0)) * np.tan(0.5), abs=2e-9)
     assert got[1] == pytest.approx(0.0, abs=1e-10)
 
 
 def test_layers_bend_level_and_rising_beams_downward() -> None:
-    # the radius of a ray's curvature is n / (−n' sin ψ): the chord leaves it by half the way over it
+    # a ray's radius of curvature is n / (−n' sin ψ), and its chord leaves it by half the path over this radius
     origin = np.array([[6_378_137.0 + 500.0, 0.0, 0.0]] * 3)
     nadir = np.radians([89.0, 90.0, 91.0])
     points = origin + 2000.0 * np.stack([-np.cos(nadir), np.sin(nadir), np.zeros(3)], axis=1)
@@ -311,7 +311,7 @@ def test_slowing_and_bending_act_together() -> None:
     chord = (true_points - origin) / lengths(true_points - origin)[:, np.newaxis]
     index = 1.0 + air.mean_refractivity(heights(origin), heights(true_points))
     first, range_m = chord, lengths(true_points - origin)[:, np.newaxis]
-    for _ in range(3):  # until the first directions are those that lead to these chords
+    for _ in range(3):  # iterate until the first directions lead to these chords
         bent = bent_by(Air(refraction="spherical"), origin, origin + range_m * first, down)
         first = turned_towards(chord, down, -bent)
     points = origin + (lengths(true_points - origin) * index)[:, np.newaxis] * first

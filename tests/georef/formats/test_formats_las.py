@@ -71,7 +71,7 @@ def test_every_field_is_read_back() -> None:
     las = read(written(points)[0])
     assert (las.header.point_format.id, str(las.header.version)) == (6, "1.4")
     assert np.abs(las.xyz - points.points_map).max() <= 0.0005 + 1e-9
-    assert np.abs(np.asarray(las.gps_time) - (points.time_ns - 10**18) / 1e9).max() <= 6e-8  # LAS' own doubles
+    assert np.abs(np.asarray(las.gps_time) - (points.time_ns - 10**18) / 1e9).max() <= 6e-8  # resolution of LAS doubles
     assert np.array_equal(las.return_number, points.return_number)
     assert np.array_equal(las.number_of_returns, points.number_of_returns)
     assert np.array_equal(las.intensity, np.rint(points.intensity))
@@ -241,7 +241,7 @@ def test_a_part_of_a_copc_file_can_be_read_alone(tree: tuple[Points, bytes]) -> 
         within = reader.query(laspy.Bounds(low, high))
         info = reader.copc_info
     assert 0.95 * NODE_POINTS < len(coarse) < 1.05 * NODE_POINTS
-    quarters = np.histogram2d(coarse.x, coarse.y, bins=4)[0]  # the overview is of everywhere alike
+    quarters = np.histogram2d(coarse.x, coarse.y, bins=4)[0]  # the overview covers everything evenly
     assert quarters.min() > 0.9 * quarters.mean()
     rounded = np.round(points.points_map[:, :2], 3)
     assert len(within) == int(((rounded >= low) & (rounded <= high)).all(axis=1).sum())

@@ -91,8 +91,8 @@ def test_pdals_file_has_the_values_of_pdals_tests() -> None:
     roll, pitch, heading = trajectory.attitude()
     assert roll == pytest.approx([PDAL[0][7], PDAL[1][7]], abs=1e-14)
     assert pitch == pytest.approx([PDAL[0][8], PDAL[1][8]], abs=1e-14)
-    assert heading[0] == pytest.approx(PDAL[0][9] - PDAL[0][10], abs=1e-14)  # less wander
-    # POSPac's axes: x 2.33 m/s to the south, y to the west, z up; so it goes by its own positions
+    assert heading[0] == pytest.approx(PDAL[0][9] - PDAL[0][10], abs=1e-14)  # without wander
+    # POSPac's axes are x south (2.33 m/s), y west, z up; this agrees with the file's positions
     step_l = np.degrees([lat[1] - lat[0], (lon[1] - lon[0]) * np.cos(lat[0])])
     course = np.arctan2(*trajectory.velocity_l()[0, 1::-1])
     assert course == pytest.approx(np.arctan2(step_l[1], step_l[0]), abs=np.radians(0.6))
@@ -147,7 +147,7 @@ def test_a_record_without_velocity_leaves_the_other_records_rotated(pospac: bool
     table[7, 5] = np.nan
     back, said = read(table), np.arange(len(table)) != 7
     np.testing.assert_allclose(back.velocity_e[said], trajectory.velocity_e[said], atol=1e-11)
-    np.testing.assert_allclose(back.velocity_e[7], trajectory.velocity_e[7], atol=0.1)  # by the positions beside it
+    np.testing.assert_allclose(back.velocity_e[7], trajectory.velocity_e[7], atol=0.1)  # from neighbouring positions
 
 
 def test_a_record_without_velocity_does_not_hide_later_wrong_velocities() -> None:

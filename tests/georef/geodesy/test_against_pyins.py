@@ -20,7 +20,7 @@ from tests.georef.navigation.flights import Fixes, drawn_start, fly, noised, set
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.xdist_group("kernels"),
-    pytest.mark.filterwarnings("ignore"),  # theirs, of newer pandas
+    pytest.mark.filterwarnings("ignore"),  # pyins causes warnings of newer pandas
 ]
 
 NOISE = replace(GRADES["tactical"], bias_correlation_s=1e9, misalignment=0.0)
@@ -35,11 +35,11 @@ def test_filter_results_match_pyins() -> None:
     truth = fly(survey(line_s=25.0), 30.0, 50.0)
     inertial, rows = noised(truth, NOISE, Fixes(sigma_m=(0.015, 0.015, 0.015), first_s=0.32), ARM, 22)
     start = drawn_start(truth, 22, attitude_rad=(2e-3, 2e-3, 5e-3))
-    setup = replace(setup_for(NOISE, ARM), gate_probability=1e-9)  # theirs has none
+    setup = replace(setup_for(NOISE, ARM), gate_probability=1e-9)  # pyins has no gate
     mine = forward(run_filter(inertial, rows, setup, start))
 
     names = ["gyro_x", "gyro_y", "gyro_z", "accel_x", "accel_y", "accel_z"]
-    seconds = np.append(0.0, (inertial.time_ns - start.time_ns) / 1e9)  # its first row only says where the next begins
+    seconds = np.append(0.0, (inertial.time_ns - start.time_ns) / 1e9)  # pyins only takes the start from its first row
     sensed = np.vstack([np.zeros(6), np.hstack([inertial.angle_b, inertial.velocity_b])])
     table = pd.DataFrame(sensed, index=seconds, columns=names)
     increments = strapdown.compute_increments_from_imu(table, "increment")

@@ -202,7 +202,7 @@ def test_places_without_coordinates_are_refused() -> None:
         frame.map_from_e(at(47.5, -40.0))
     with pytest.raises(MappingError, match="more than 1000 km outside"):
         frame.map_from_e(at(-30.0, 9.0))
-    assert frame.map_from_e(at(47.5, 15.0))[0, 0] > 900_000.0  # a neighbouring zone is at home here
+    assert frame.map_from_e(at(47.5, 15.0))[0, 0] > 900_000.0  # the neighbouring zone would be usual here
     assert len(frame.map_from_e(np.empty((0, 3)))) == 0
 
 
@@ -310,7 +310,7 @@ def test_error_for_a_frame_of_another_place_or_scale_names_the_local_zone(
         ("EPSG:32632", 47.5, 8.9),
         ("EPSG:32632", 47.5, 12.4),  # 30 km beyond the zone: within the overlap of neighbours
         ("EPSG:2154", 46.5, 3.0),
-        ("EPSG:3857", 2.0, 8.0),  # near the equator its metre is one
+        ("EPSG:3857", 2.0, 8.0),  # near the equator a metre of the map is one on the ground
         ("EPSG:4978", 47.5, 8.9),
     ],
 )

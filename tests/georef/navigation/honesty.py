@@ -59,7 +59,7 @@ def judge(flights: list[FloatArray]) -> dict[str, Honesty]:
         means = nees.mean(axis=1)
         each = nees.var(axis=0, ddof=1).mean()
         independent = len(means) * float(np.clip(each / means.var(ddof=1), 1.0, nees.shape[1]))
-        degrees = 2.0 / each * independent  # of a χ² whose mean is 1 and whose variance at one moment is that
+        degrees = 2.0 / each * independent  # degrees of freedom of a χ² with mean 1 and this variance at a moment
         low, high = chi2.ppf([0.001, 0.999], degrees) / degrees
         found[name] = Honesty(float(means.mean()), float(low), float(high), independent)
     return found

@@ -17,8 +17,8 @@ from tests.georef.navigation.flights import BASELINE_B, Fixes, Truth, drawn_star
 from tests.georef.navigation.vehicles import ns
 
 ARM = np.array([0.35, -0.12, -1.1])
-SHARE, TAU_S = 0.5, 60.0  # of the positions' variance that lasts
-HEADING_SHARE = 0.36  # of the headings', as `swath trajectory` assumes
+SHARE, TAU_S = 0.5, 60.0  # share of the positions' variance that lasts, and its time constant
+HEADING_SHARE = 0.36  # the same for headings, as `swath trajectory` assumes
 
 
 @dataclass(frozen=True)

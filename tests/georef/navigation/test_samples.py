@@ -60,7 +60,7 @@ def one_by_one(rows: StructArray, time_ns: Int64Array, **options: Any) -> tuple[
 
 def test_means_become_increments_over_the_true_intervals() -> None:
     rng = np.random.default_rng(1)
-    edges = np.concatenate([[0.0], np.cumsum(rng.uniform(0.004, 0.006, 2000))])  # sampled unevenly, stamped so
+    edges = np.concatenate([[0.0], np.cumsum(rng.uniform(0.004, 0.006, 2000))])  # uneven sampling with true stamps
     got = Sampler(RATE_HZ).feed(means(edges), ns(edges[1:]))
     assert len(got) == 2000
     assert not got.bridged.any()
@@ -72,12 +72,12 @@ def test_means_become_increments_over_the_true_intervals() -> None:
 def test_jitter_of_timestamps_does_not_reach_the_increments() -> None:
     rng = np.random.default_rng(2)
     edges = np.arange(20001) / RATE_HZ
-    stamps = edges[1:] + rng.uniform(-0.002, 0.002, 20000)  # sampled evenly, stamped badly
+    stamps = edges[1:] + rng.uniform(-0.002, 0.002, 20000)  # even sampling with bad stamps
     got = Sampler(RATE_HZ).feed(means(edges), ns(stamps))
-    # Free fall must vanish: what remains of force + gravity in each interval is what the sensor said, not the stamp.
+    # In free fall this must be zero: force + gravity over each interval depends on the sensor, not on the stamp.
     left = got.velocity_b - FORCE * got.interval_s[:, None]
     assert np.abs(left).max() < 1e-12
-    assert np.abs(got.velocity_b[:, 2] + 9.8 / RATE_HZ).max() > 0.015  # which nominal intervals would have left over
+    assert np.abs(got.velocity_b[:, 2] + 9.8 / RATE_HZ).max() > 0.015  # nominal intervals would leave this over
     assert abs(got.interval_s[1:].sum() - (stamps[-1] - stamps[0])) < 1e-7
     turned = np.cumsum(got.angle_b, axis=0) - rate_integral(stamps)
     assert np.abs(turned - turned.mean(axis=0)).max() < 1.5e-3  # rad, no more than a stamp's error times the rate
@@ -157,7 +157,7 @@ def test_unusable_rows_are_counted_by_reason() -> None:
     rows["specific_force_b"][60, 0] = -40.0
     stamps[100] = stamps[99]
     stamps[200] = stamps[190]
-    stamps[300] += 604_800_000_000_000  # one stamp gone astray must not swallow all that follow
+    stamps[300] += 604_800_000_000_000  # one wrong stamp must not make all later ones be refused
     stamps[400] -= 604_800_000_000_000
     sampler = Sampler(RATE_HZ, full_scale=(40.0, 10.0))
     got = sampler.feed(rows, stamps)

@@ -34,7 +34,7 @@ from tests.georef.navigation.virtual_aircraft import (
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
 
 SEEDS = 10
-MISALIGNMENT = 5e-3  # large, so that a filter that knows nothing of it is far off
+MISALIGNMENT = 5e-3  # so large that a filter without this state is far off
 
 
 @cache

@@ -34,7 +34,7 @@ def test_the_consumer_grade_matches_its_data_sheet() -> None:
     """InvenSense PS-MPU-6000A 3.4, 6.1, 6.2 state 0.005 °/s/√Hz, 400 µg/√Hz, ±80 mg, scales of ±3 %, axes of ±2 %."""
     noise = GRADES["consumer"]
     assert noise.velocity_random_walk == pytest.approx(400e-6 * 9.80665, rel=0.03)
-    assert 1.0 <= noise.angle_random_walk / np.radians(0.005) < 2.0  # of other units of the kind more
+    assert 1.0 <= noise.angle_random_walk / np.radians(0.005) < 2.0  # other units of the grade have more
     assert noise.accel_bias == pytest.approx(0.080 * 9.80665, rel=1e-3)
     assert np.radians(0.1) < noise.gyro_bias < np.radians(1.0)
     assert max(noise.gyro_scale, noise.accel_scale) == pytest.approx(0.03 / 3.0)

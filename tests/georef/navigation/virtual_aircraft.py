@@ -27,12 +27,12 @@ from tests.georef.navigation.vehicles import BEGIN_NS, ns, observed
 
 ARM = (0.35, -0.12, -1.1)
 WHITE_M = np.array([0.01, 0.01, 0.02])
-BEGIN_S = 20.0  # standing
+BEGIN_S = 20.0  # at rest
 RATE_HZ = 200
 LIKELY = (0.005, 0.995)
-LASTING_H = 1e4  # a bias that lasts so long is constant
+LASTING_H = 1e4  # a bias with so long a time constant is constant
 
-# The sensors of fixtures/navigation/reference_flight; accelerometers' mGal in mg
+# The sensors of fixtures/navigation/reference_flight; mGal of accelerometers are converted to mg
 REFERENCE = {
     "tactical": ImuNoiseTable(
         angle_random_walk_deg_per_sqrt_h=0.04, velocity_random_walk_m_per_s_per_sqrt_h=0.03,

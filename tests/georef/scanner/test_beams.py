@@ -99,7 +99,7 @@ def test_palmer_scan_with_another_shaft_angle_follows_its_formula() -> None:
 def test_risley_pair_follows_its_formula() -> None:
     wedge = np.radians(10.0)
     single = points_s(RisleyGeometry((wedge, 1e-12), 1.51), 0.0)[0]
-    assert np.degrees(np.arctan2(-single[0], single[2])) == pytest.approx(5.201161908, abs=1e-8)  # to the thick end
+    assert np.degrees(np.arctan2(-single[0], single[2])) == pytest.approx(5.201161908, abs=1e-8)  # toward the thick end
     pair = points_s(RisleyGeometry((wedge, wedge), 1.51, prism_ratio=2.5), np.radians(30.0))[0]
     assert pair[:2] / pair[2] == pytest.approx([-0.1038005615, -0.1361184971], abs=1e-10)
     assert np.linalg.norm(pair) == pytest.approx(1.0, abs=1e-14)

@@ -138,7 +138,7 @@ def test_covariance_is_read() -> None:
     assert covariance[omega, omega] == pytest.approx(sigma_omega**2, rel=1e-12)
     assert covariance[offset, offset] == pytest.approx(1e-4, rel=1e-12)
     assert covariance[omega, time] == covariance[time, omega] == pytest.approx(-0.5 * sigma_omega * sigma_time)
-    assert np.count_nonzero(covariance) == 5  # what was held fixed has none
+    assert np.count_nonzero(covariance) == 5  # held parameters have none
 
 
 def test_the_shortest_valid_file_is_read() -> None:

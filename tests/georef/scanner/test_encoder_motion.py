@@ -68,7 +68,7 @@ def test_pulses_without_returns_and_with_several_give_the_same_motion() -> None:
     rows, time_ns, rate_rps, acceleration_rps2 = read(sine(np.radians(30.0), 50.0), 100_000.0, 0.1, BITS_17)
     rng = np.random.default_rng(8)
     repeats = rng.integers(0, 4, len(rows))
-    repeats[3000:3120] = 0  # a lake
+    repeats[3000:3120] = 0  # over a lake there are no returns
     keep = np.repeat(np.arange(len(rows)), repeats)
     _, rate, acceleration = run(rows[keep], time_ns[keep])
     assert 1e-6 * np.abs(rate - rate_rps[keep]).max() < 0.1 * BITS_17
@@ -76,7 +76,7 @@ def test_pulses_without_returns_and_with_several_give_the_same_motion() -> None:
     same = np.flatnonzero(np.diff(keep) == 0)
     np.testing.assert_array_equal(rate[same], rate[same + 1])
     once = np.unique(keep)
-    _, alone, _ = run(rows[once], time_ns[once])  # a repeated row weighs nothing
+    _, alone, _ = run(rows[once], time_ns[once])  # a repeated row has no weight
     np.testing.assert_array_equal(rate, alone[np.searchsorted(once, keep)])
 
 
@@ -87,7 +87,7 @@ def test_rate_of_a_polygon_is_estimated_across_its_facets(facets: int, turns_hz:
     _, rate, acceleration = run(rows, time_ns, steady=True, facets=True)
     assert np.abs(rate / rate_rps - 1.0).max() < 0.01
     assert not acceleration.any()
-    if facets == 4:  # its jumps are seen in the readings too
+    if facets == 4:  # with four facets its jumps show in the readings too
         _, blind, _ = run(rows, time_ns, steady=True)
         np.testing.assert_array_equal(blind, rate)
 
@@ -96,7 +96,7 @@ def test_rate_of_a_polygon_is_estimated_across_its_facets(facets: int, turns_hz:
 def test_a_shaft_turns_on_through_zero(turns_hz: float) -> None:
     rows, time_ns, rate_rps, _ = read(turning(turns_hz), 100_000.0, 0.05, BITS_17)
     _, rate, _ = run(rows, time_ns, steady=True)
-    assert np.abs(np.diff(rows["encoder_rad"])).max() > 6.0  # it went through zero
+    assert np.abs(np.diff(rows["encoder_rad"])).max() > 6.0  # the reading passed zero
     assert np.abs(rate / rate_rps - 1.0).max() < 2e-3
 
 
@@ -107,7 +107,7 @@ def test_results_do_not_depend_on_how_rows_are_cut(seed: int) -> None:
     rows, time_ns, _, _ = read(motion, 60_000.0, 0.04, BITS_17)
     keep = np.repeat(np.arange(len(rows)), rng.integers(0, 3, len(rows)))
     keep = keep[(keep < 800) | (keep > 1100)]
-    order = np.r_[:600, 700:760, 600:700, 760 : len(keep)]  # and a datagram that came late
+    order = np.r_[:600, 700:760, 600:700, 760 : len(keep)]  # one datagram comes late
     rows, time_ns = rows[keep[order]], time_ns[keep[order]]
     _, rate, acceleration = run(rows, time_ns, **keys)
     for cuts in (np.arange(0, len(rows), 7), np.sort(rng.integers(0, len(rows), 30))):

@@ -94,7 +94,7 @@ def test_parameter_derivatives_match_central_differences(kind: str, mount: Mount
             continue
         step = STEPS.get(name, ANGLE_STEP)
         if kind == "risley" and name == "scan_angle_scale":
-            step = 1e-6  # of hundreds of radians
+            step = 1e-6  # the angle has hundreds of radians
         at = calibration.value(name)
         moved = [shots.rays(calibration.changed(**{name: at + f * step})).points_e for f in (-1, -0.5, 0.5, 1)]
         slope = slope_of(moved, step)
@@ -218,7 +218,7 @@ def test_first_order_effects_on_flat_ground_match_the_formula_sheet() -> None:
         "phi_rad": (1000, 0, 0),
         "kappa_rad": (-363.97023, 0, 0),
         "range_offset_m": (0, 0.34202014, 0.93969262),
-        "scan_angle_offset_rad": (0, -1000, 363.97023),  # as ω = −Δθ: not to be told apart
+        "scan_angle_offset_rad": (0, -1000, 363.97023),  # like ω = −Δθ, so they cannot be separated
         "scan_angle_scale": (0, 349.06585, -127.04958),
         "scan_plane_tilt_rad": (-1064.1778, 0, 0),
         "pitch_slope": (1000 * theta, 0, 0),

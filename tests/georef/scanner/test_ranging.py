@@ -42,9 +42,9 @@ def longer_m(ticks: int, tick_hz: int, group_index: float, about_m: float) -> fl
         (6.67128190396, 1.0, 1000.0, 1e-8),
         (6.67128190396, 1.000276394225, 1000.0 - 0.276317853, 1e-8),
         (1e-3, 1.0, 0.149896229, 1e-12),
-        (0.1, 1.0, 14.9896229, 5e-9),  # a tone of 10 MHz
-        (5.338500646, 1.000276394225, 800.0, 1e-7),  # when a range gate opens
-        (10.00968871, 1.000276394225, 1500.0, 1e-6),  # and closes
+        (0.1, 1.0, 14.9896229, 5e-9),  # the ambiguity of a tone of 10 MHz
+        (5.338500646, 1.000276394225, 800.0, 1e-7),  # a range gate opens at this time
+        (10.00968871, 1.000276394225, 1500.0, 1e-6),  # and closes at this time
     ],
 )
 def test_ranges_match_the_formula_sheet(flight_us: float, group_index: float, range_m: float, within_m: float) -> None:
@@ -118,7 +118,7 @@ def train(
     return np.array([row for _, row in said], RETURN_DTYPE), np.array(true, RETURN_DTYPE)
 
 
-FIRST = {"mta_gap": 3}  # records of the first three pulses hold no echo, and tell of no emission
+FIRST = {"mta_gap": 3}  # echoes in records of the first three pulses have unknown emissions
 
 
 def flat(height_m: float = 1000.0) -> Any:
@@ -160,7 +160,7 @@ def test_the_zone_changes_with_the_scan_angle_and_the_ground() -> None:
     found = fed(resolver, rows)
     assert_true(found, true)
     assert len(np.unique(found["mta_zone"])) > 3
-    assert sum(resolver.counts.values()) < 12  # an echo may come with an emission, too far from anything
+    assert sum(resolver.counts.values()) < 12  # an echo that coincides with an emission may be missing
 
 
 def test_returns_of_one_pulse_get_the_same_zone() -> None:
@@ -217,7 +217,7 @@ def test_an_ambiguous_pulse_between_uneven_tick_steps_is_counted_as_a_gap() -> N
     rows, true = train(sparse, 2500, 100 * np.diff(ticks), half_angle_rad=0.1)
     resolver = ZoneResolver(2000.0, 1000.0, tick_hz=10_000_000, slanted=False)
     assert_true(fed(resolver, rows), true)
-    assert 6 < resolver.counts["mta_gap"] < 60  # where two steps are 23 ticks the middle one is not known
+    assert 6 < resolver.counts["mta_gap"] < 60  # if two steps are 23 ticks, the pulse between is unknown
 
 
 def test_a_lost_datagram_costs_only_earlier_pulses() -> None:
@@ -226,7 +226,7 @@ def test_a_lost_datagram_costs_only_earlier_pulses() -> None:
     resolver = ZoneResolver(2000.0, 1000.0)
     found = fed(resolver, rows[datagram != 20])
     assert_true(found, true)
-    assert resolver.counts == {"mta_gap": 6}  # zone 3: and of the first three records after it
+    assert resolver.counts == {"mta_gap": 6}  # zone 3 concerns three records after it too
     assert len(found) == len(rows) - np.count_nonzero(datagram == 20) - 6
 
 
@@ -248,7 +248,7 @@ def test_results_do_not_depend_on_how_rows_are_cut(seed: int) -> None:
         return [880.0 + 0.03 * pulse - above for above in (0.0, 2.5, 14.0)[: pulse * 7 % 4]]
 
     rows, _ = train(forest, 900, rng.integers(1990, 2010, 900) if seed == 2 else 2000)
-    rows["mta_zone"][600:700] = 3  # and a stretch whose zone is known
+    rows["mta_zone"][600:700] = 3  # a stretch with a known zone
     whole = fed(ZoneResolver(2000.0, 870.0, slanted=False), rows)
     known = whole[np.isin(whole["pulse_id"], rows["pulse_id"][600:700])]
     assert len(known) >= 100
@@ -276,7 +276,7 @@ def test_terrain_has_precedence_over_continuity() -> None:
     assert len(found) == len(rows) - resolver.counts["mta_gap"] - resolver.counts["mta_ambiguous"]
     assert sum(resolver.counts.values()) < 20
     alone = ZoneResolver(2000.0, 870.0)
-    assert len(fed(alone, rows)) < 0.6 * len(rows)  # 130 m are 0.43 of a zone: ambiguous, and said so
+    assert len(fed(alone, rows)) < 0.6 * len(rows)  # 130 m are 0.43 of a zone, so many are ambiguous and counted
     assert alone.counts["mta_ambiguous"] > 0.4 * len(rows)
 
 
@@ -330,7 +330,7 @@ def test_a_laser_pause_leaves_no_gap_if_every_pulse_is_recorded() -> None:
     assert not resolver.counts
     unsure = ZoneResolver(2500.0, 1200.0)
     assert_true(fed(unsure, rows), true)
-    assert set(unsure.counts) == {"mta_gap"}  # how many pulses were between, the time does not say
+    assert set(unsure.counts) == {"mta_gap"}  # the time does not reveal how many pulses were lost
 
 
 def test_context_rows_are_not_counted() -> None:
@@ -359,7 +359,7 @@ def test_the_tick_rate_follows_the_header(cuts: tuple[int, ...]) -> None:
     rates.note(409, 500e3, 150_000_000)
     resolver = ZoneResolver(2000.0, 1000.0, slanted=False, rates=rates)
     found = fed(resolver, rows, cuts)
-    assert resolver.counts == {"mta_gap": 6}  # three at either beginning
+    assert resolver.counts == {"mta_gap": 6}  # three at each of two beginnings
     np.testing.assert_allclose(found["range_m"], 1000.0, rtol=0, atol=1e-9)
     wanted = np.concatenate([rows["device_time_ns"][:397], rows["device_time_ns"][400:797]])
     np.testing.assert_array_equal(found["device_time_ns"], wanted)
@@ -395,7 +395,7 @@ def test_apparent_ranges_of_a_recording_are_assigned_to_their_pulse(prf_hz: floa
     near = sum(1 for t, r in got if {(t, r), (t, r - 1), (t, r + 1)} & wanted)
     assert near == len(found)
     assert len(found) + sum(resolver.counts.values()) == len(rows)
-    if prf_hz == 250_000.0:  # 40 ticks: every pulse is known
+    if prf_hz == 250_000.0:  # a period of 40 whole ticks, so every pulse is known
         assert len(found) > 0.99 * len(rows)
 
 

@@ -146,7 +146,7 @@ def test_the_model_is_exact_everywhere_on_earth_with_every_error(kind: str) -> N
     case, rng = CASES[kind], np.random.default_rng(5)
     flights = Flights.all_over_the_earth(rng)
     shots = Shots.of(case, flights, rng)
-    slope = 0.0 if kind == "fibre" else case.calibration().value("pitch_slope")  # θ of a fibre is its own
+    slope = 0.0 if kind == "fibre" else case.calibration().value("pitch_slope")  # each fibre has its own fixed θ
     calibration = case.calibration(pitch_slope=slope)
     rays = shots.rays(SensorModel(calibration, case.geometry), flights.trajectory())
     assert (rays.fate == Fate.GEOREFERENCED).all()
@@ -300,7 +300,7 @@ def test_small_corrections_have_the_sizes_of_the_formula_sheet() -> None:
     assert edge.points_e[0, 0] == pytest.approx(0.50, abs=0.005)
     torsion = SensorModel(UNIT.changed(torsion_s2=2e-9), LineGeometry())
     theta = 0.5
-    pulled = -((2 * np.pi * 40.0) ** 2) * theta  # of a sine at 40 Hz
+    pulled = -((2 * np.pi * 40.0) ** 2) * theta  # acceleration of a sine at 40 Hz
     rays_1 = torsion.rays(
         rows_of(theta, 1000.0),
         time_ns,

@@ -31,7 +31,7 @@ START_NS, STEP_NS = 1_479_297_618_000_000_000, 5_000_000
 NOISE = Noise(range_m=0.02, angle_rad=3e-5, time_s=2e-5, divergence_rad=3e-4)
 NOMINAL = nominal("left", np.zeros(3), np.eye(3))
 DEG = np.pi / 180
-# value and sigma of each parameter; a sigma is large enough to be seen beside the others
+# value and sigma of each parameter; each sigma is large enough to matter beside the others
 SIZES = {
     "omega_rad": (0.5 * DEG, 4e-5),
     "phi_rad": (0.5 * DEG, 4e-5),
@@ -191,7 +191,7 @@ def test_every_covariance_element_matches_sampled_inputs() -> None:
     worst = 0.0
     for k in range(GEOMETRIES):
         geometry = random_geometry(rng, random_correlation(rng))
-        if k % 3 == 0:  # the usual few parameters, whose errors are summed before the returns
+        if k % 3 == 0:  # with the few usual parameters, errors are summed before the returns
             few = [name in USUAL for name in NAMES]
             sigmas = np.where(few, geometry.calibration.sigmas, 0.0)
             geometry = replace(geometry, calibration=replace(geometry.calibration, sigmas=sigmas))

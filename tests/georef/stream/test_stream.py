@@ -41,7 +41,7 @@ WEEK, TOW_S = 2423, 86_400
 GPS_0 = WEEK * WEEK_NS + TOW_S * SECOND_NS  # at host time 0 of the tests
 HOST_0 = 1_781_514_000 * SECOND_NS
 DEVICE_0 = 3_000 * SECOND_NS + 111_222_333  # of the scanner's counter at the same moment
-DRIFT = 20e-6  # of the scanner: fast
+DRIFT = 20e-6  # the scanner's clock is fast
 TICK = 100_000_000
 PLAN = ClockPlan(
     0,
@@ -185,7 +185,7 @@ def errors_s(rig: Rig) -> np.ndarray[Any, Any]:
 def test_returns_before_the_lock_wait_and_are_then_timed() -> None:
     rig = Rig().run(20.0)
     first_tick, first = rig.placed[0]
-    assert 4.0 <= first_tick <= 5.2  # five edges make a train
+    assert 4.0 <= first_tick <= 5.2  # locking takes five edges
     assert first.points_map[0, 1] == 0.0  # from the first return on
     assert len(first) > 300
     assert errors_s(rig)[: len(first)].max() < 5e-6
@@ -195,7 +195,7 @@ def test_returns_before_the_lock_wait_and_are_then_timed() -> None:
 
 def test_returns_whose_lock_comes_too_late_have_no_time() -> None:
     rig = Rig(pps_s=(3.0, 1e9)).run(20.0)
-    assert 100 < rig.fates()[Fate.NO_TIME] < 500  # the lock is some 4.1 s after 3 s, and 5 s are waited
+    assert 100 < rig.fates()[Fate.NO_TIME] < 500  # PPS comes after 3 s and the lock 4.1 s later; returns wait 5 s
     assert errors_s(rig).max() < 5e-6
     tick, points = rig.placed[0]
     assert points.points_map[0, 1] == pytest.approx(tick - 5.0, abs=0.11)
@@ -208,7 +208,7 @@ def test_every_return_has_one_fate_at_the_end() -> None:
     assert rig.stream.waiting("left") == 0
     assert sum(fates.values()) == rig.given
     assert fates[Fate.GEOREFERENCED] == sum(len(points) for _, points in rig.placed)
-    assert fates[Fate.OUTSIDE_TRAJECTORY] > 700  # behind the trajectory's end
+    assert fates[Fate.OUTSIDE_TRAJECTORY] > 700  # after the trajectory's end
 
 
 def test_a_scanner_without_latch_runs_free_and_is_refused() -> None:

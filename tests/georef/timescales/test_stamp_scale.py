@@ -11,7 +11,7 @@ from swath.georef.timescales import DeviceClock, Stamps, StampScale
 from swath.georef.timescales.stamp_scale import judge
 from tests.builders import NS, START_S, host_clock, host_ns
 
-UNIX_MINUS_GPS_S = 315_964_800  # of UTC, but for the leap seconds
+UNIX_MINUS_GPS_S = 315_964_800  # without leap seconds
 LEAP = 18
 HOUR = 3600 * NS
 

@@ -18,7 +18,7 @@ from swath.georef.timescales.edge_train import _chain_noise_ns
 from tests.georef.clock_run import rms, run
 from tests.georef.clock_simulation import Edges, Oscillator, Sender, Simulation, week_tag
 
-pytestmark = pytest.mark.xdist_group("sigma")  # the same oscillators are looked at in several ways
+pytestmark = pytest.mark.xdist_group("sigma")  # several tests use the same oscillators
 
 START = 1_479_297_618
 SECONDS = 5400

@@ -209,7 +209,7 @@ def separated(mark: str, comma: bool, dms_cells: bool = False) -> str:
     place = ("-8 30 0.0", "47 24 1.5") if dms_cells else ("-8.5000000000", "47.4004166667")
     units = UNITS.replace("(deg) (deg) (m)", "(+/-D!M!S) (+/-D!M!S) (m)") if dms_cells else UNITS
     lines = [mark.join(NAMED.split()), mark.join(units.split()).replace("!", " ")]
-    if mark == ";":  # some programs end every line with one
+    if mark == ";":  # some programs end each line with a delimiter
         lines = [line + mark for line in lines]
     for i in range(4):
         cells = [
@@ -273,7 +273,7 @@ def test_waypoint_decimal_degrees_and_units_without_brackets_are_read() -> None:
     assert np.degrees([lat[0], lon[0], lon[3]]) == pytest.approx([31.0, 121.0, 121.00003])
     assert height == pytest.approx([10.5] * 4)
     assert np.degrees([angle[0] for angle in trajectory.attitude()]) == pytest.approx([-2.0, 1.0, 359.0])
-    # it has no velocities: those of the way, 1e-5° of longitude each 0.1 s
+    # the file has no velocities; those of the path are 1e-5° of longitude each 0.1 s
     eastwards_mps = 10 * (prime_vertical_radius_m(lat[0]) + 10.5) * np.cos(lat[0]) * np.radians(1e-5)
     np.testing.assert_allclose(trajectory.velocity_l(), np.tile([0.0, eastwards_mps, 0.0], (4, 1)), atol=1e-5)
 

@@ -60,7 +60,7 @@ def test_attitude_between_epochs_matches_scipys_slerp() -> None:
     seconds = (trajectory.time_ns - START_NS) / 1e9
     expected = Slerp(seconds, as_rotation(trajectory.q_e_from_b))((at - START_NS) / 1e9)
     difference = (as_rotation(trajectory.poses(at).q_e_from_b) * expected.inv()).magnitude()
-    assert difference.max() < 1e-12  # 1e-9 m at a kilometre; the turns are up to π
+    assert difference.max() < 1e-12  # 1e-9 m at a kilometre, although rotations are up to π
 
 
 def test_small_rotations_match_scipys_slerp() -> None:
@@ -72,7 +72,7 @@ def test_small_rotations_match_scipys_slerp() -> None:
     seconds = (trajectory.time_ns - START_NS) / 1e9
     expected = Slerp(seconds, as_rotation(trajectory.q_e_from_b))((at - START_NS) / 1e9)
     difference = (as_rotation(trajectory.poses(at).q_e_from_b) * expected.inv()).magnitude()
-    assert difference.max() < 1e-14 * 50  # SciPy's own arithmetic
+    assert difference.max() < 1e-14 * 50  # limited by SciPy's own rounding
     np.testing.assert_allclose(np.linalg.norm(trajectory.poses(at).q_e_from_b, axis=1), 1, rtol=0, atol=2e-15)
 
 
@@ -311,7 +311,7 @@ def test_body_velocity_differs_from_the_antenna_velocity_in_a_turn() -> None:
     antenna = wild(n, time_ns=times, velocity_l=speed, heading_rad=heading, **still, **level)
     np.testing.assert_allclose(antenna.velocity_l()[100], [0, 0.2, 0], atol=1e-12)
     np.testing.assert_allclose(antenna.at_body([2.0, 0, 0]).velocity_l(), 0, atol=1e-6)
-    # the turn over a gap is no turn rate of the epochs beside it
+    # the rotation over a gap does not affect the turn rate of the epochs beside it
     kept = np.r_[0:80, 150:n]
     gap = wild(
         len(kept),

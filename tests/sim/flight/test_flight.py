@@ -357,7 +357,7 @@ def test_the_nose_points_into_the_relative_wind() -> None:
     trajectory = flown({"flight": {"wind_mps": [0.0, -12.0]}})
     east = (trajectory.lines[0].start_s + trajectory.lines[0].end_s) / 2
     _, _, heading = trajectory.attitude(np.array([east]))
-    # flying east over the ground in a wind from the north: the nose is to the left, into it
+    # on a course of east with wind from the north, the nose points left of the course
     assert math.degrees(heading[0]) == pytest.approx(90.0 - math.degrees(math.atan2(12.0, 60.0)), abs=0.01)
 
 

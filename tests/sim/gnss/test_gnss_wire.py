@@ -261,14 +261,14 @@ def test_pyubx2_reads_the_ubx_messages() -> None:
         assert (solution.fixType, solution.gnssFixOk, solution.carrSoln, solution.numSV) == (3, 1, 2, 20)
         found = np.array([solution.velN, solution.velE, solution.velD, solution.gSpeed]) / 1e3
         assert np.abs(found - [north, east, down, math.hypot(north, east)]).max() < VELOCITY_MPS["ubx"]
-        # half a unit, and half a unit of NAV-HPPOSLLH, which is rounded before
+        # half a unit, and half a unit of NAV-HPPOSLLH, which is rounded first
         assert abs(solution.lat - math.degrees(lat[row])) < 0.506e-7
         assert abs(solution.lon - math.degrees(lon[row])) < 0.506e-7
         assert abs(solution.height - 1e3 * height[row]) < 0.551
         assert abs(solution.hMSL + 47300 - 1e3 * height[row]) < 0.551
         off = (solution.headMot - math.degrees(math.atan2(east, north)) + 180) % 360 - 180
         assert abs(off) < 0.5e-5 + 1e-5
-    # hAcc is of both axes together (NN + EE of NAV-COV)
+    # hAcc combines both axes (NN + EE of NAV-COV)
     assert fine[0].hAcc / 1e3 == pytest.approx(
         math.sqrt(first["NAV-COV"].posCovNN + first["NAV-COV"].posCovEE), abs=1e-4
     )
@@ -422,7 +422,7 @@ def test_an_outage_has_no_solutions_but_keeps_time(protocol: str) -> None:
         assert len(of(GnssHeading, records)) == len(positions) - 20
     named = {round(at.time_s(m), 6): m.valid for m in of(TimeMessage, records) if m.time.week or m.time.date}
     for number in range(1, 25):
-        # RMC cannot vouch for its time without a fix (status V), the binary ones do
+        # RMC without a fix (status V) cannot confirm its time; the binary messages can
         assert named[float(number)] == (protocol != "nmea" or not 5 <= number < 9)
 
 

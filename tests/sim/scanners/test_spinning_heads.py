@@ -142,7 +142,7 @@ def test_vlp16_points_match_the_driver_at_the_true_azimuth() -> None:
 
 
 def test_os1_points_match_the_driver() -> None:
-    # the range the head says is the distance from the pulse's origin: nothing is left to be added
+    # the reported range counts from the pulse's origin, so nothing is added
     pulses = head_of("os1").pulses(0.0, 0.1)
     rows = np.zeros(len(pulses), RETURN_DTYPE)
     rows["range_m"] = np.random.default_rng(1).uniform(1, 200, len(rows))
@@ -163,7 +163,7 @@ def test_a_vlp16_reports_the_azimuth_of_the_first_firing_of_each_group(scan_hz: 
     error = turned_deg(first, pulses.direction_s[:whole:32])
     assert np.abs(error).max() <= 0.005 + 1e-9
     assert np.abs(error).max() > 0.0045
-    # and a turn takes the time it should
+    # a turn has the right duration
     steps = turned_deg(pulses.direction_s[: whole - 32 : 32], pulses.direction_s[32:whole:32])
     np.testing.assert_allclose(steps, 360 * scan_hz * 110.592e-6, rtol=0, atol=1e-9)
 

@@ -158,7 +158,7 @@ def test_timestamps_are_utc_past_the_hour_across_the_end_of_the_hour() -> None:
     placed, believed = gps_ns_past_hour(device, plan.start_gps_ns + rows["host_time_ns"], plan.leap_seconds)
     assert believed.all()
     early_ns = plan.start_gps_ns + truth["gps_ns"] - placed - 250_000
-    # floor to a microsecond, and 20 ppm over a packet
+    # rounding down to a microsecond, and 20 ppm over a packet
     assert early_ns.min() >= -30
     assert early_ns.max() < 1000
 
@@ -171,7 +171,7 @@ def test_azimuths_are_true_to_a_hundredth_of_a_degree() -> None:
     error = np.degrees((rows["encoder_rad"] - true_rad + np.pi) % (2 * np.pi) - np.pi)
     last_group = truth["pulse"] % 384 >= 352
     assert np.abs(error[~last_group]).max() <= 0.005 + 1e-9
-    # the packet's last group is turned on by the rotation before it: the rounding of two azimuths on top of its own
+    # the last group is extrapolated by the previous rotation, so the rounding of two azimuths is added
     assert 0.005 < np.abs(error[last_group]).max() <= 0.015
 
 
@@ -269,7 +269,7 @@ def past_hour_s(plan: Plan, lost: list[tuple[float, float]], times_s: list[float
 
 
 def test_after_lost_pulses_the_head_continues_by_its_oscillator() -> None:
-    # edges of seconds 2 and 3 are lost; two in a row lock again: at second 5
+    # edges of seconds 2 and 3 are lost; two consecutive edges lock again, at second 5
     plan = plan_of("vlp16", oscillator={"offset_ppm": 60.0}, true={"time_offset_us": 40.0})
     lost = [(1.5, 3.5)]
     units = wire_of(plan, lost).idle(0.0, 7.0)

@@ -18,7 +18,7 @@ def main() -> None:
     for request in (PTRACE_SEIZE, PTRACE_INTERRUPT):
         if libc.ptrace(request, thread, None, None) != 0:
             raise OSError(ctypes.get_errno(), "ptrace")
-    # who does not wait for the end of what he traces keeps the process from ending
+    # a tracer that does not wait for the end of its tracee would keep the process from ending
     while os.WIFSTOPPED(os.waitpid(thread, WAIT_ALL)[1]):
         pass
 

@@ -214,7 +214,7 @@ class TestStatus:
         assert found["trajectory"]["source"] == "gnss/rover"
         coverage = json.loads((folder / "coverage.json").read_text())
         assert coverage["points"] == sum(found["points"].values())
-        # two scanners of 8000 pulses a second in all, at 50 m/s: pulses over the area that they fall into
+        # two scanners with 8000 pulses/s together at 50 m/s: pulses divided by their area
         assert 0.5 < coverage["density_per_m2"]["mean"] < 20.0
 
     def test_one_sentence_names_the_problem(self, replayed: tuple[Path, Told]) -> None:

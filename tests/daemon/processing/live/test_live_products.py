@@ -68,7 +68,7 @@ class TestMcap:
         place = [pose["pose"]["position"].get(axis, 0.0) for axis in "xyz"]
         np.testing.assert_allclose(place + products.frame.origin, position, rtol=0, atol=1e-6)
         turned = Rotation.from_quat([pose["pose"]["orientation"].get(axis, 0.0) for axis in "xyzw"])
-        # heading 45° from true north; grid north lies east or west of it by the convergence, dλ sin φ (Snyder 8)
+        # heading is 45° from true north, which differs from grid north by the convergence, dλ sin φ (Snyder 8)
         convergence = np.radians(LON_DEG - 9.0) * np.sin(np.radians(LAT_DEG))
         heading = np.radians(45.0) - convergence
         np.testing.assert_allclose(turned.apply([1, 0, 0]), [np.sin(heading), np.cos(heading), 0], atol=1e-5)

@@ -134,7 +134,7 @@ def test_velodyne_points_match_velodyne_decoder(recording: Velodyne) -> None:
     ours, wanted = as_ros(points_s(model_of(recording.protocol, parser), rows)), xyz(theirs)
     np.testing.assert_allclose(np.linalg.norm(ours, axis=1), np.linalg.norm(wanted, axis=1), rtol=0, atol=2e-5)
     np.testing.assert_allclose(ours[:, 2], wanted[:, 2], rtol=0, atol=1e-4)
-    # it takes one speed a packet, also where the field of view of the VLP-32C steps over half a turn
+    # theirs uses one speed per packet, also where the field of view of the VLP-32C skips half a turn
     turned = np.degrees(rows["encoder_rad"])
     steps = (np.abs(turned - 90.0) < 4.0) | (np.abs(turned - 270.0) < 4.0)
     sure = ~steps | (recording.head is VLP16)

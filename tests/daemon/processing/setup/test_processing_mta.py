@@ -256,7 +256,7 @@ def test_echoes_are_assigned_to_their_pulse(terrain: bool) -> None:
     assert right.mean() > 0.999
     assert apart_m[right].max() < 0.002
     np.testing.assert_array_equal(right, apart_m < 0.002)
-    # what is lost: echoes whose emission was
+    # echoes are lost if their emission was
     counts = made.fates
     assert counts[Fate.GEOREFERENCED] + counts[Fate.MTA_GAP] + counts.get(Fate.MTA_AMBIGUOUS, 0) == true.came.sum()
     assert counts[Fate.MTA_GAP] == (true.came & ~true.known).sum() > 5

@@ -75,7 +75,7 @@ def test_clocks_equal_those_of_the_recorder(setup: Setup) -> None:
     assert plan.host_minus_monotonic_ns == 3_000
     assert plan.pps == {"pps/main": PpsPlan(18, 0)}
     assert plan.gnss == {"gnss/rover": GnssPlan("pps/main", None, 18)}
-    # a head without a pulse of its own is on the host's clock; Velodyne's stamps count from the hour
+    # a head without its own pulse uses the host's clock; Velodyne's stamps count from the hour
     assert plan.devices == {
         "scanner/left": DevicePlan("pps/main"),
         "scanner/top": DevicePlan("pps/main", True, StampScale.AUTO),
@@ -115,7 +115,7 @@ def test_the_attitude_of_an_ins_is_converted_to_the_body(tmp_path: Path) -> None
     got = Rotation.from_euler("ZYX", [turned["heading_rad"], turned["pitch_rad"], turned["roll_rad"]])
     rot_b_from_imu = Rotation.from_matrix([[0, 1, 0], [-1, 0, 0], [0, 0, 1]])
     assert (got.inv() * told * rot_b_from_imu.inv()).magnitude() < 1e-12
-    # the same turn of the aircraft, seen by gyroscopes along the IMU's axes
+    # the same rotation of the aircraft, measured along the IMU's axes
     assert setup.sources.in_b(np.array([[1.0, 2.0, 3.0]]))[0] == pytest.approx([2.0, -1.0, 3.0])
     assert row["roll_rad"][0] == 0.1
 

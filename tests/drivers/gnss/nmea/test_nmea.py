@@ -43,7 +43,7 @@ def parse(*sentences: bytes, config: dict[str, object] | None = None) -> tuple[l
 
 # --- recordings ---
 
-# what gpsd adds to the dates of recordings older than its release expects
+# gpsd adds this to the dates of recordings older than its release expects
 GPSD_ROLLOVER = dt.timedelta(weeks=1024)
 WITH_POSITIONS = [
     "beidou-bd.log",

@@ -68,7 +68,7 @@ def test_points_agree_with_velodyne_decoder(name: str, total: int) -> None:
     with np.load(FIXTURES / f"{name}.velodyne_decoder.npz") as archive:
         theirs = archive["points"]
     ours = rows[: len(theirs)]
-    # it gives a pair's last return first; both are put in the order of firing, then range
+    # the other decoder gives a pair's last return first; both are sorted by firing, then range
     their_range = np.linalg.norm(xyz(theirs), axis=1)
     theirs = theirs[np.lexsort([their_range, theirs["ring"], theirs["column"]])]
     column = np.unique(ours["device_time_ns"] - 2304 * ours["channel"].astype(np.int64), return_inverse=True)[1]

@@ -99,7 +99,7 @@ def test_vlp32c_agrees_with_velodyne_decoder() -> None:
     np.testing.assert_allclose(points[:, 2], theirs["z"], atol=1e-5)
     seconds = ours["device_time_ns"] * 1e-9
     np.testing.assert_allclose(seconds - seconds.min(), theirs["time"] - theirs["time"].min(), atol=1e-6)
-    # it takes one speed a packet, also of the packets over which the field of view steps from 90° to 270°
+    # theirs uses one speed per packet, also where the field of view skips from 90° to 270°
     azimuth = np.arctan2(points[:, 1], points[:, 0]) - np.arctan2(theirs["y"], theirs["x"])
     apart_deg = np.degrees(np.abs(np.angle(np.exp(1j * azimuth))))
     turned = np.degrees(ours["encoder_rad"])

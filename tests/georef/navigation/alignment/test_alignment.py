@@ -112,7 +112,7 @@ def test_gyroscopes_that_sense_earth_rotation_find_north_at_rest() -> None:
         assert start.text.startswith("aligned standing still, by gyrocompassing: heading ")
         assert np.degrees(start.attitude_sigma_rad[2]) < 2.0
         errors.append(normalised(recording, start))
-    assert np.sqrt(np.mean(np.array(errors)[:, 2] ** 2)) < 1.0  # nothing stands as still as it does here
+    assert np.sqrt(np.mean(np.array(errors)[:, 2] ** 2)) < 1.0  # no real vehicle stands so still
     assert 0.4 < np.sqrt(np.mean(np.array(errors)[:, :2] ** 2)) < 1.5
 
 
@@ -122,7 +122,7 @@ def test_gyroscopes_that_cannot_sense_earth_rotation_wait_for_motion_and_report_
         found(recording)
     said = re.search(r"heading (\d+)°", str(refused.value))
     assert said is not None
-    assert int(said[1]) > 90  # a bias of 25 °/h against 10 °/h of the earth tells nothing
+    assert int(said[1]) > 90  # with a bias of 25 °/h the earth's 10 °/h show no heading
 
 
 def test_correlated_noise_is_not_taken_for_knowledge() -> None:
@@ -135,7 +135,7 @@ def test_correlated_noise_is_not_taken_for_knowledge() -> None:
     rows = rows[rows["time_ns"] <= felt.time_ns[-1]]
     problem = Problem(felt, rows, parked_one.setup, rows["time_ns"][rows["kind"] == Kind.POSITION])
     fitted = problem.fit(problem.first_guess())
-    assert np.degrees(fitted.sigma(TILT)[2]) > 15.0  # 11° if the residuals' noise were taken for motion
+    assert np.degrees(fitted.sigma(TILT)[2]) > 15.0  # 11° would result if the noise of residuals were taken for motion
 
 
 def test_drifting_gnss_positions_are_not_taken_for_motion() -> None:
@@ -244,7 +244,7 @@ def test_heading_of_a_real_car_matches_its_direction_of_travel() -> None:
         course = np.arctan2(speed["value"][now, 1], speed["value"][now, 0])
         if np.hypot(*speed["value"][now, :2]) > 5.0:
             turn = (start.attitude_rad[2] - course + np.pi) % (2 * np.pi) - np.pi
-            off.append(turn / np.hypot(start.attitude_sigma_rad[2], np.radians(2.0)))  # it slips a little in bends
+            off.append(turn / np.hypot(start.attitude_sigma_rad[2], np.radians(2.0)))  # the car slips a little in bends
     assert len(off) > 6
     assert np.sqrt(np.mean(np.square(off))) < 1.5
     assert np.abs(off).max() < 3.0
@@ -261,7 +261,7 @@ def test_attitude_of_a_real_light_aircraft_matches_its_own_filter() -> None:
         off.append(np.degrees((start.attitude_rad[2] - heading + np.pi) % (2 * np.pi) - np.pi))
         assert abs(np.degrees(start.attitude_rad[0] - np.arctan2(rot[2, 1], rot[2, 2]))) < 3.0
         assert abs(np.degrees(start.attitude_rad[1] + np.arcsin(rot[2, 0]))) < 3.0
-    assert np.abs(off).max() < 6.0  # with crabbing of up to 30°, and a filter that is good to some degrees itself
+    assert np.abs(off).max() < 6.0  # it crabs by up to 30°, and the filter itself is right to some degrees
     assert np.median(np.abs(off)) < 3.0
 
 

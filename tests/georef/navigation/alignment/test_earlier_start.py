@@ -81,7 +81,7 @@ def test_the_earlier_start_matches_the_truth(velocities: bool) -> None:
     found = earlier_start(samples(), observations(velocities=velocities), SETUP, start_at(15.0))
     true = start_at(0.2)
     assert found.time_ns == true.time_ns
-    assert np.abs(found.attitude_rad - true.attitude_rad).max() < 1e-6  # and the frames' turn between the two places
+    assert np.abs(found.attitude_rad - true.attitude_rad).max() < 1e-6  # with the turn between the places' frames
     assert np.abs(found.position_e - true.position_e).max() < 1e-5
     assert (np.abs(found.velocity_l - true.velocity_l) <= (1e-5 if velocities else found.velocity_sigma_l)).all()
 

@@ -176,7 +176,7 @@ def test_derivatives_of_each_observation_match_difference_quotients(kind: Kind, 
         np.testing.assert_allclose(rows[:m, j], quotient, rtol=0, atol=allowed, err_msg=f"{j}")
 
 
-TURNING = 1e-4  # velocity by position: north and east turn with it; by attitude: the earth's turn of the lever arm
+TURNING = 1e-4  # north and east turn with the position, the lever arm with the earth
 
 
 def test_covariance_propagation_matches_dense_matrices() -> None:

@@ -133,7 +133,7 @@ def test_an_hour_shows_schuler_oscillation(what: str) -> None:
     force, tilt, drift = 0.0, 0.0, 0.0
     if what == "accelerometer":
         force = 2e-4
-        state[ACCEL_BIAS] = -force  # taken off what is measured
+        state[ACCEL_BIAS] = -force  # it is subtracted from the measurement
     elif what == "tilt":
         tilt = 2e-5
         state = state_of(position_e[0], np.zeros(3), level @ rot_l_from_b(0.0, -tilt, 0.0))
@@ -174,7 +174,7 @@ def test_three_minutes_match_pyins() -> None:
     theirs = of_pyins.Integrator(first).integrate(table)
     there = lla_to_ecef(theirs[LLA_COLS].iloc[-1].to_numpy())
     travelled = np.linalg.norm(found[-1, :3] - place)
-    assert np.linalg.norm(found[-1, :3] - there) < 0.2  # of what noise and biases have made hundreds of metres
+    assert np.linalg.norm(found[-1, :3] - there) < 0.2  # noise and biases cause hundreds of metres
     assert travelled > 2000.0
 
 
