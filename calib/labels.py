@@ -97,6 +97,16 @@ def decimals_of(sigma: float, most: int = 9) -> int:
     return min(max(1 - exponent, 0), most)
 
 
+LEAST_P = 1e-6  # smaller probabilities are told as smaller than this
+
+
+def p_words(value: float) -> str:
+    """Return the probability of a test in words, such as ``p 0.70`` or ``p < 1e-06``."""
+    if value < LEAST_P:
+        return f"p < {LEAST_P:g}"
+    return f"p {value:.2f}" if value >= 0.01 else f"p {value:.2g}"
+
+
 def number(value: float | None, pattern: str = ".3g") -> str:
     """Format a number with a real minus sign; a dash stands for None or a number that is not finite."""
     if value is None or not math.isfinite(value):

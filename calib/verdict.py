@@ -7,7 +7,18 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from swath.calib.labels import degrees, is_undetermined, length, listed, number, share, sized, unknown, words_of
+from swath.calib.labels import (
+    degrees,
+    is_undetermined,
+    length,
+    listed,
+    number,
+    share,
+    sized,
+    unknown,
+    with_sigma,
+    words_of,
+)
 from swath.calib.outcome import Adjusted, Considered
 from swath.calib.summary import Difference, Pair, ReportInput
 from swath.georef.verdicts import Level, Reason, Rule, Verdict, worst_first
@@ -143,7 +154,10 @@ def _contradicted(report: ReportInput) -> Iterator[tuple[str, float]]:
     for one in report.adjusted.considered:
         if one.contradicted:
             name = f"{one.scanner}.{one.name}"
-            change = f"{sized(name, one.told, sign=True)} ± {sized(name, one.told_sigma)}"
+            named = unknown(name)
+            text = with_sigma(named.factor * one.told, named.factor * one.told_sigma)
+            gap = "" if named.unit == "°" else "\u00a0"
+            change = f"{text}{gap}{named.unit}"
             yield f"the held value of {unknown_words(name, several)}: it would change the value by {change}", 1.0
 
 

@@ -69,7 +69,7 @@ def find_planes(
                 planes[piece] = plane_of("", "roof" if pieces.steep[piece] else "ground", sights)
         if not len(fresh):
             break
-    refused["enough of them"] += len(pieces.steep) - len(tried)
+    refused["more than needed"] += len(pieces.steep) - len(tried)
     order = [piece for piece in dict.fromkeys([*chosen.tolist(), *planes]) if piece in planes]
     return Features(planes=named([planes[piece] for piece in order][: settings.most_planes]), refused=+refused)
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from swath.calib.labels import number, unknown, with_sigma
+from swath.calib.labels import number, p_words, unknown, with_sigma
 from swath.calib.validation.history import (
     ALPHA,
     BORESIGHT,
@@ -40,7 +40,6 @@ from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, Calibration
 
 TIMES = 3.29  # sigmas; one in a thousand by chance
-LEAST_P = 1e-6
 UNKNOWN_MOUNTING = "mounting not recorded"
 
 
@@ -75,12 +74,14 @@ class Course:
         if self.kind == "once":
             return f"{one.words}: {sized}, of one calibration"
         if self.kind == "constant":
-            return f"{one.words}: constant, {sized} (mean of {self.count}, {_p(self.p)})"
+            return f"{one.words}: constant, {sized} (mean of {self.count}, {p_words(self.p)})"
         if self.kind == "drift":
-            return f"{one.words}: drifts by {sized} a year (of the line {_p(self.p)})"
+            return f"{one.words}: drifts by {sized} a year (of the line {p_words(self.p)})"
         if self.kind == "jump":
             return f"{one.words}: jumped by {sized} between {self.before} and {self.after}"
-        return f"{one.words}: changes by more than its sigmas, neither steadily nor once; mean {sized} ({_p(self.p)})"
+        return (
+            f"{one.words}: changes by more than its sigmas, neither steadily nor once; mean {sized} ({p_words(self.p)})"
+        )
 
     def record(self) -> dict[str, Any]:
         """Return the course for JSON, in the unit of the key."""
@@ -126,7 +127,7 @@ class Step:
         if self.compared is None:
             return f"{when}: not tested: {self.why_not}"
         step = self.compared
-        p = f"χ² {number(step.chi2, '.1f')} of {step.freedom}, {_p(step.p)}"
+        p = f"χ² {number(step.chi2, '.1f')} of {step.freedom}, {p_words(step.p)}"
         if not step.moved:
             return f"{when}: no significant change ({p})"
         large = [row.words for row in sorted(step.rows, key=lambda row: -row.times) if row.times > TIMES]
@@ -329,10 +330,6 @@ def _jump(value: FloatArray, sigma: FloatArray, at: int) -> tuple[float, float, 
     """Return the difference of the means from an index on and before it, its sigma, and the χ² that is left."""
     before, after = _mean(value[:at], sigma[:at]), _mean(value[at:], sigma[at:])
     return after[0] - before[0], math.hypot(before[1], after[1]), before[2] + after[2]
-
-
-def _p(value: float) -> str:
-    return f"p {value:.2g}" if value >= LEAST_P else f"p < {LEAST_P:g}"
 
 
 def _sigma(one: Calibration, name: str) -> float:

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-from swath.calib.labels import number, with_sigma
+from swath.calib.labels import number, p_words, with_sigma
 from swath.georef.scanner.calibration import INDEX, PARAMETERS, BeamCorrection, Calibration
 
 LIKE = 1.0 / 3.0  # of a sigma: a difference of this size adds a twentieth to the expected square
@@ -321,15 +321,17 @@ def _sentences(scanner: str, steps: Sequence[Compared], trends: Sequence[Trend],
             largest = max(step.rows, key=lambda row: abs(row.difference) / row.sigma)
             found.append(
                 f"{scanner}: the boresight has moved between {when[step.earlier]} and {when[step.later]}: "
-                f"{largest.words}; χ² {step.chi2:.1f} of {step.freedom}, p {step.p:.2g}"
+                f"{largest.words}; χ² {step.chi2:.1f} of {step.freedom}, {p_words(step.p)}"
             )
     for trend in trends:
         if trend.p < ALPHA:
             key = PARAMETERS[INDEX[trend.name]].key
             text = with_sigma(math.degrees(trend.per_year), math.degrees(trend.sigma))
-            found.append(f"{scanner}: {key} drifts by {text} a year (p {trend.p:.2g})")
+            found.append(f"{scanner}: {key} drifts by {text} a year ({p_words(trend.p)})")
     worst = min(step.p for step in steps)
-    return found or [f"{scanner}: the boresight has not moved: {len(steps)} steps, the least likely with p {worst:.2g}"]
+    return found or [
+        f"{scanner}: the boresight has not moved: {len(steps)} steps, the least likely with {p_words(worst)}"
+    ]
 
 
 def created_words(one: Calibration) -> str:

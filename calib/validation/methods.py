@@ -24,7 +24,7 @@ from swath.calib.equations.observability import RULES_OF_ALL
 from swath.calib.equations.trajectory_prior import ERRORS, Taus, TrajectoryPrior, gauss_markov
 from swath.calib.features import ControlPoint, Features
 from swath.calib.flight import Flight
-from swath.calib.labels import number
+from swath.calib.labels import number, p_words
 from swath.calib.strips.differences import Numbers
 from swath.calib.strips.effects import EFFECTS
 from swath.calib.validation.distances import Rows, control_rows, estimated_floor_m, plane_rows
@@ -199,18 +199,25 @@ class Validation:
     def sentence(self) -> str:
         """The verdict, with unfulfilled requests and undetectable errors."""
         applied = [method for method in self.methods if method.passed is not None]
+        return self.summary + ("" if not applied or not all(method.passed for method in applied) else self._unseen())
+
+    @property
+    def summary(self) -> str:
+        """The verdict, with unfulfilled requests."""
+        applied = [method for method in self.methods if method.passed is not None]
         failed = [method.name for method in applied if not method.passed]
         undone = f"a requested check could not be done: {'; '.join(self.undone)}" if self.undone else ""
         if not applied:
             return f"nothing could be validated{'; ' if undone else ''}{undone}"
         alone = " (not independent)" if self.dependent else ""
         if failed:
-            verdict = f"the calibration does not hold{alone}: {', '.join(failed)} of {len(applied)} methods failed"
+            verdict = f"the calibration does not hold{alone}: {len(failed)} of {len(applied)} methods failed"
+            verdict += "" if len(failed) == len(applied) else f": {', '.join(failed)}"
             return f"{verdict}{'; ' if undone else ''}{undone}"
         could = f"{len(applied)} of 6 methods could be applied, and all passed"
         if undone:
-            return f"not validated as requested{alone}: {undone}; {could}{self._unseen()}"
-        return f"the calibration holds{alone}: {could}{self._unseen()}"
+            return f"not validated as requested{alone}: {undone}; {could}"
+        return f"the calibration holds{alone}: {could}"
 
     def _unseen(self) -> str:
         """Describe in words the errors that would not have been detected."""
@@ -439,20 +446,20 @@ def _sentence(name: str, what: str, numbers: Numbers, tests: Sequence[Test]) -> 
     )
     chi2, mean = tests[:2]
     if len(tests) > 2 and not tests[2].passed:
-        verdict = f"{tests[2].words}: χ² {tests[2].value:,.0f} of {tests[2].freedom:,.0f}, p {tests[2].p:.2g}"
+        verdict = f"{tests[2].words}: χ² {tests[2].value:,.0f} of {tests[2].freedom:,.0f}, {p_words(tests[2].p)}"
     elif len(tests) > 3 and not tests[3].passed:
-        verdict = f"{tests[3].words}: p {tests[3].p:.2g}"
+        verdict = f"{tests[3].words}: {p_words(tests[3].p)}"
     elif not chi2.passed:
-        verdict = f"more than expected (χ² {chi2.value:,.0f} of {chi2.freedom:,.0f}, p {chi2.p:.2g})"
+        verdict = f"more than expected (χ² {chi2.value:,.0f} of {chi2.freedom:,.0f}, {p_words(chi2.p)})"
     elif not mean.passed:
-        verdict = f"the mean is not zero (z {number(mean.value, '.1f')}, p {mean.p:.2g})"
+        verdict = f"the mean is not zero (z {number(mean.value, '.1f')}, {p_words(mean.p)})"
     elif stats.chi2.cdf(chi2.value, chi2.freedom) < ALPHA:
         verdict = (
             f"less than expected (χ² {chi2.value:,.0f} of {chi2.freedom:,.0f}): the trajectory's sigmas are larger "
             "than its errors, so the test is less sensitive than it could be"
         )
     else:
-        verdict = f"as expected (χ² {chi2.value:,.0f} of {chi2.freedom:,.0f}, p {chi2.p:.2g})"
+        verdict = f"as expected (χ² {chi2.value:,.0f} of {chi2.freedom:,.0f}, {p_words(chi2.p)})"
     return f"{name} ({CODES[name]}): {what}: {values}: {verdict}"
 
 
@@ -500,7 +507,7 @@ def _anew(calibrations: Mapping[str, Calibration], anew: Mapping[str, Calibratio
     verdict = "agree with the calibration" if test.passed else "do not agree with the calibration"
     sentence = (
         f"{name} ({CODES[name]}): {freedom} independently measured parameters {verdict} (χ² {squares:.1f} of "
-        f"{freedom}, p {test.p:.2g}); largest: {largest.words}"
+        f"{freedom}, {p_words(test.p)}); largest: {largest.words}"
     )
     shift = math.sqrt(_noncentrality(freedom))
     smallest = tuple(

@@ -155,7 +155,9 @@ def command(
     for line in products.warnings:
         print(one_line(f"swath: {line}"), file=sys.stderr)
     if products.record["verdict"]["level"] == "unusable" and not accept_verdict:
-        raise UserError(f"{output}: {one_line(products.record['verdict']['sentence'])}")
+        problem = f"{output}: {one_line(products.record['verdict']['sentence'])}"
+        accepting = f'{output}: the verdict is "not to be used"; use --accept-verdict to accept it'
+        raise UserError(problem if as_json else accepting)  # stdout has the verdict
 
 
 def _refuse(output: Path, observe: str, *, overwrite: bool) -> None:

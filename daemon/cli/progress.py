@@ -28,6 +28,7 @@ FROM_S = 2.0  # a phase has to last so long before its remaining time is estimat
 SLOWEST = 10.0  # of anything but bytes in a second; a lower rate says less than the percentage
 BAR_WIDTH = 24
 PAPER_COLUMNS = 1000  # of what no terminal shows: a file or a pipe cuts and folds nothing
+LEAST_TOLD_S = 1.0  # of compiling
 COMPILING = (
     "compiling for this computer: this takes a minute or more and happens once; swath warm-up does it beforehand"
 )
@@ -239,7 +240,7 @@ def _compiling_noticed(display: Display, say: Callable[[str], None]) -> Iterator
     with before_compiling(display.compiling) as compiling:
         display.compile_s = lambda: compiling.seconds
         yield
-    if compiling.seconds:
+    if compiling.seconds >= LEAST_TOLD_S:
         again = "later runs use the stored code"
         if not compiling.kept:
             again = "no cache folder is writable, so every run compiles; set NUMBA_CACHE_DIR"

@@ -144,8 +144,8 @@ def _print_lines(console: Console, rows: list[dict[str, Any]]) -> None:
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, header_style="bold")
-    for column in ("line", "length", "time", "above ground, least", "mean", "swath", "pulses/m²", "overlap"):
-        table.add_column(column, justify="left" if column == "line" else "right")
+    for column in ("line", "length", "time", "lowest", "mean", "swath", "per m²", "overlap"):
+        table.add_column(column, justify="left" if column == "line" else "right", no_wrap=column == "line")
     for row in rows[:-1]:
         figures = ("length_m", "seconds", "height_min_m", "height_mean_m", "swath_m", "density_per_m2")
         units = ("m", "s", "m", "m", "m", "")

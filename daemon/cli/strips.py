@@ -156,6 +156,7 @@ def _compare(
     all_pairs: bool,
 ) -> None:
     from swath.daemon.cli.progress import progress_bar
+    from swath.daemon.processing.carried_verdict import acceptance
     from swath.daemon.processing.earlier_runs import refuse_existing
     from swath.daemon.processing.pages.names import STRIPS
     from swath.daemon.processing.strips.compare import RECORD, StripsOptions, compare_strips, rules_of
@@ -180,14 +181,14 @@ def _compare(
     for line in warnings:
         print(one_line(f"swath: {line}"), file=sys.stderr)
     if done.problem:
-        raise UserError(done.problem)
+        raise UserError(done.problem if as_json else acceptance(done.record["verdict"]))  # stdout has the verdict
 
 
 def _adjust(
     logs: GeorefOptions, folder: Path, control: ControlFile | None, strip_model: str, *, overwrite: bool, as_json: bool
 ) -> None:
     from swath.daemon.cli.progress import progress_bar
-    from swath.daemon.processing.carried_verdict import refusal
+    from swath.daemon.processing.carried_verdict import acceptance, refusal
     from swath.daemon.processing.strips.adjust import AdjustOptions, correct_strips
     from swath.daemon.processing.strips.adjust_products import write_adjustment
 
@@ -196,7 +197,7 @@ def _adjust(
         products = write_adjustment(request, correct_strips(request, Path(returns), tell), tell)
     print(json.dumps(products.record, indent=2) if as_json else "\n".join(map(one_line, products.lines)))
     if line := refusal(products.record["verdict"]):
-        raise UserError(line)
+        raise UserError(line if as_json else acceptance(products.record["verdict"]))  # stdout has the verdict
 
 
 def _refuse_besides(*given: tuple[str, object]) -> None:

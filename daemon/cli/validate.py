@@ -98,6 +98,7 @@ def command(
     surveyed = read_control_file(control, control_crs, control_columns)  # before all that takes seconds to import
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
+    from swath.daemon.processing.carried_verdict import acceptance
     from swath.daemon.processing.earlier_runs import refuse_existing
     from swath.daemon.processing.flights.read import GeorefOptions
     from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
@@ -137,4 +138,4 @@ def command(
     for line in done.warnings:
         print(one_line(f"swath: {line}"), file=sys.stderr)
     if done.problem:
-        raise UserError(done.problem)
+        raise UserError(done.problem if as_json else acceptance(done.record["verdict"]))  # stdout has the verdict

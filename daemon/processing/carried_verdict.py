@@ -108,6 +108,11 @@ def refusal(entry: Mapping[str, Any]) -> str:
     return f"{first_lines(entry)[0]}; use --accept-verdict to accept it"
 
 
+def acceptance(entry: Mapping[str, Any]) -> str:
+    """Return what `refusal` says without the verdict, for a command that has printed that; empty as there."""
+    return f'the verdict is "{Level.UNUSABLE.words}"; use --accept-verdict to accept it' if refusal(entry) else ""
+
+
 # ---------------------------------------------------------------------- calibrations
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +56,22 @@ def stale_pages(folder: Path, points: Iterable[Path]) -> list[Path]:
             if shown & gone:
                 found += [*listed_files(record), record]
     return found
+
+
+def stale_records(outcome: Path, scanners: Collection[str]) -> list[Path]:
+    """Return the records beside the outcome of an earlier calibration that are of other scanners than these.
+
+    Args:
+        outcome: file whose ``calibrations`` has the id of each scanner's calibration; records with other ids stay.
+        scanners: names of the scanners whose records are replaced.
+    """
+    named = _read(outcome).get("calibrations")
+    found: list[Path] = []
+    for name, identity in named.items() if isinstance(named, dict) else ():
+        record = outcome.with_name(f"{Path(name).name}.record.json")
+        if name not in scanners and _read(record).get("id") == identity:
+            found += [record.with_suffix(suffix) for suffix in (".xml", ".npz", ".json")]
+    return [path for path in found if path.is_file() and not path.is_symlink()]
 
 
 def _texts(record: dict[str, Any], key: str) -> list[str]:

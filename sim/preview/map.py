@@ -7,14 +7,16 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
 from matplotlib.colors import LightSource, LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from matplotlib.patheffects import withStroke
+from matplotlib.text import Annotation
 from matplotlib.ticker import FuncFormatter, MaxNLocator
-from matplotlib.transforms import ScaledTranslation
+from matplotlib.transforms import Bbox, ScaledTranslation
 
 from swath.georef.arrays import FloatArray
 from swath.sim.flight.envelope import Ground
@@ -28,6 +30,7 @@ LAND = LinearSegmentedColormap.from_list("land", ["#c9d9b5", "#e3e7c8", "#f1e8cf
 HALO = (withStroke(linewidth=2.6, foreground="white", alpha=0.85),)
 SHADE_CELLS = 420
 KILOMETRES_FROM_M = 30_000.0
+NAMES_ASIDE_PT = (0.0, 10.0, -10.0, 20.0, -20.0)  # to the right of a line, where its name is tried
 
 
 def thousands(value: float) -> str:
@@ -85,9 +88,10 @@ def draw_map(
     axes.plot(*way[-1], marker="s", ms=5, color=INK, mec="white", mew=0.8, zorder=8)
     for strip, colour in zip(survey.strips, chart.colours, strict=True):
         _line(axes, strip, colour, chart)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
+    _names(axes, survey, chart)
     control = chart.place(np.asarray(control_points(survey.plan, survey.scene))[:, :2])
     axes.plot(control[:, 0], control[:, 1], ls="", marker="^", ms=5.5, color="#ffd23f", mec=INK, mew=0.7, zorder=7)
-    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     for axis, word, size_m in ((axes.xaxis, "Easting", high[0] - low[0]), (axes.yaxis, "Northing", high[1] - low[1])):
         unit, metres = ("km", 1000.0) if size_m > KILOMETRES_FROM_M else ("m", 1.0)
         axis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
@@ -192,7 +196,7 @@ def _swath(axes: Axes, outline: FloatArray, colour: str, alpha: float) -> None:
 
 
 def _line(axes: Axes, strip: Strip, colour: str, chart: Chart) -> None:
-    """Draw a line with an arrow, its name behind its beginning, a little to its right."""
+    """Draw a line with an arrow, a little to its right."""
     start, end = chart.place(np.stack([strip.from_m, strip.end_m]))
     ahead = (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
     aside = np.array([ahead[1], -ahead[0]]) * 1.4 / 72.0
@@ -203,23 +207,43 @@ def _line(axes: Axes, strip: Strip, colour: str, chart: Chart) -> None:
         tip = start + part * (end - start)
         arrow = (3, 0, turned - 90.0)
         axes.plot(*tip, marker=arrow, ms=9, color=colour, mec="white", mew=0.7, transform=moved, zorder=6.2)
-    upright = (turned + 90.0) % 180.0 - 90.0
-    forward = abs(turned - upright) < 1.0
-    axes.annotate(
-        shortened(strip.name, 14),
-        xy=(start[0], start[1]),
-        xytext=(-6.0 * ahead[0], -6.0 * ahead[1]),
-        textcoords="offset points",
-        rotation=upright,
-        rotation_mode="anchor",
-        ha="right" if forward else "left",
-        va="center",
-        fontsize=8,
-        weight="bold",
-        color=colour,
-        path_effects=HALO,
-        zorder=9,
-    )
+
+
+def _names(axes: Axes, survey: Survey, chart: Chart) -> None:
+    """Write the lines' names at their beginnings or ends, where they cover no other name if there is such a place."""
+    figure = page_of(axes)
+    canvas: Any = figure.canvas if isinstance(figure.canvas, FigureCanvasAgg) else FigureCanvasAgg(figure)
+    renderer, taken = canvas.get_renderer(), list[Bbox]()
+    for strip, colour in zip(survey.strips, chart.colours, strict=True):
+        start, end = chart.place(np.stack([strip.from_m, strip.end_m]))
+        ahead = (end - start) / max(float(np.linalg.norm(end - start)), 1e-9)
+        right, turned = np.array([ahead[1], -ahead[0]]), math.degrees(math.atan2(ahead[1], ahead[0]))
+        upright = (turned + 90.0) % 180.0 - 90.0
+        forward = abs(turned - upright) < 1.0
+        style: dict[str, Any] = {"rotation": upright, "rotation_mode": "anchor", "va": "center", "zorder": 9}
+        style |= {"fontsize": 8, "weight": "bold", "color": colour, "path_effects": HALO}
+        tried: list[tuple[float, Annotation, Bbox]] = []
+        for aside in NAMES_ASIDE_PT:
+            for place, way in ((start, -1.0), (end, 1.0)):
+                offset = 6.0 * way * ahead + aside * right
+                flush = "right" if forward == (way < 0.0) else "left"
+                words = axes.annotate(
+                    shortened(strip.name, 20), (place[0], place[1]), (offset[0], offset[1]),
+                    textcoords="offset points", ha=flush, **style,
+                )  # fmt: skip
+                box = words.get_window_extent(renderer)
+                tried.append((sum(_shared(box, other) for other in taken), words, box))
+        _, best, box = min(tried, key=lambda one: one[0])
+        taken.append(box)
+        for _, words, _ in tried:
+            if words is not best:
+                words.remove()
+
+
+def _shared(one: Bbox, other: Bbox) -> float:
+    """Return the area that two rectangles share, square pixels."""
+    both = Bbox.intersection(one, other)
+    return 0.0 if both is None else float(both.width * both.height)
 
 
 def _scale_bar(axes: Axes, low: FloatArray, high: FloatArray) -> None:

@@ -19,12 +19,24 @@ from swath.sim.plan.errors import PlanError
 from swath.sim.plan.plan import Plan
 from swath.sim.preview.chart import Chart
 from swath.sim.preview.coverage import Grid, Survey, grid_of, summary_of
-from swath.sim.preview.map import INK, MUTED, draw_ground, draw_map, heading, nice_step, page_of, shortened, thousands
+from swath.sim.preview.map import (
+    HALO,
+    INK,
+    MUTED,
+    draw_ground,
+    draw_map,
+    heading,
+    nice_step,
+    page_of,
+    shortened,
+    thousands,
+)
 from swath.sim.scene.terrain import build_ground
 
 FORMATS = (".pdf", ".png", ".svg")
 DPI = 150
 GROUND_CELLS = 500  # cells of the ground along the map's longer side
+COORDINATE_IN = 0.6  # room for a coordinate on a small map
 WIDE = 1.7  # maps wider than this times their height are above the other panels, not beside them
 STRETCH = 8.0  # ratio of the sides from which on the shorter one is drawn at a larger scale
 OVERLAP_COLOURS = ("#f2ead3", "#a8d5ba", "#5fb0a5", "#2f7fa3", "#3d4f96", "#4b2a78")
@@ -70,8 +82,8 @@ def draw_plan(plan: Plan, path: Path) -> list[dict[str, Any]]:
     ground_m = _wide_ground(survey, chart, *frame[:2])
     draw_map(axes["map"], survey, track, ground_m, frame, chart)
     _profile(axes["profile"], survey, track, ground_m, chart)
-    _density(axes["density"], survey, grid)
-    _overlap(axes["overlap"], survey, grid)
+    _density(axes["density"], survey, grid, chart)
+    _overlap(axes["overlap"], survey, grid, chart)
     _table(axes["table"], rows, chart.colours)
     figure.savefig(path, dpi=DPI)
     return rows
@@ -201,15 +213,15 @@ def _profile_lines(axes: Axes, survey: Survey, unit_s: float, top: float, colour
             axes.text(middle, top, shortened(strip.name, 12), fontsize=6, color=INK, ha="center", va="bottom")
 
 
-def _density(axes: Axes, survey: Survey, grid: Grid) -> None:
+def _density(axes: Axes, survey: Survey, grid: Grid, chart: Chart) -> None:
     shown = np.ma.masked_equal(grid.density, 0.0)
     top = nice_step(float(np.percentile(shown.compressed(), 95.0)), up=True)
     image = axes.imshow(shown, extent=_bounds(grid), origin="lower", cmap="YlGnBu", vmin=0.0, vmax=top, aspect="auto")
-    _small_map(axes, survey, grid, "Pulses per m²")
+    _small_map(axes, survey, grid, chart, "Pulses per m²")
     _bar(axes, image, [])
 
 
-def _overlap(axes: Axes, survey: Survey, grid: Grid) -> None:
+def _overlap(axes: Axes, survey: Survey, grid: Grid, chart: Chart) -> None:
     most = min(int(grid.lines.max()), len(OVERLAP_COLOURS))
     colours = ListedColormap(OVERLAP_COLOURS[:most])
     shown = np.ma.masked_equal(np.minimum(grid.lines, most), 0)
@@ -217,7 +229,7 @@ def _overlap(axes: Axes, survey: Survey, grid: Grid) -> None:
     image = axes.imshow(
         shown, extent=_bounds(grid), origin="lower", cmap=colours, norm=norm, aspect="auto", interpolation="nearest"
     )
-    _small_map(axes, survey, grid, "Number of lines that see the ground")
+    _small_map(axes, survey, grid, chart, "Number of lines that see the ground")
     more = int(grid.lines.max()) > most
     _bar(axes, image, [f"{n}{' or more' if more and n == most else ''}" for n in range(1, most + 1)])
 
@@ -227,7 +239,7 @@ def _bounds(grid: Grid) -> tuple[float, float, float, float]:
     return (grid.east_m[0] - half, grid.east_m[-1] + half, grid.north_m[0] - half, grid.north_m[-1] + half)
 
 
-def _small_map(axes: Axes, survey: Survey, grid: Grid, title: str) -> None:
+def _small_map(axes: Axes, survey: Survey, grid: Grid, chart: Chart, title: str) -> None:
     """Draw the frame of a map of the swaths alone, with the objects on the ground for orientation."""
     west, east, south, north = _bounds(grid)
     panel = axes.get_position().bounds
@@ -238,7 +250,33 @@ def _small_map(axes: Axes, survey: Survey, grid: Grid, title: str) -> None:
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), facecolor="#f6f6f2")
     axes.set_xticks([])
     axes.set_yticks([])
+    _graticule(axes, chart, low, high)
     heading(axes, title, 5.0, weight="bold")
+
+
+def _graticule(axes: Axes, chart: Chart, low: FloatArray, high: FloatArray) -> None:
+    """Draw lines of easting and northing, a little inclined here, and write their coordinates at the edges."""
+    corners = np.array([[east, north] for east in (low[0], high[0]) for north in (low[1], high[1])])
+    placed, inches = chart.place(corners), axes.get_position().size * page_of(axes).get_size_inches()
+    first, last = placed.min(axis=0), placed.max(axis=0)
+    style: dict[str, Any] = {"fontsize": 5.5, "color": MUTED, "path_effects": HALO, "zorder": 8}
+    for axis in (0, 1):
+        most = max(1.0, inches[axis] / COORDINATE_IN)
+        step = nice_step(float(last[axis] - first[axis]) / most, up=True)
+        for value in np.arange(np.ceil(first[axis] / step), last[axis] / step) * step:
+            ends = np.array([first, last])
+            ends[:, axis] = value
+            (one, two) = chart.back(ends)
+            axes.plot([one[0], two[0]], [one[1], two[1]], color=MUTED, lw=0.4, alpha=0.6, zorder=7.5)
+            other = 1 - axis  # where the line meets the lower or the left edge
+            place = one + (two - one) * (low[other] - one[other]) / (two[other] - one[other])
+            share = float((place[axis] - low[axis]) / (high[axis] - low[axis]))
+            if 0.1 < share < 0.93:
+                turned: dict[str, Any] = {"ha": "center", "va": "bottom"}
+                if axis == 1:
+                    turned = {"ha": "left", "va": "center", "rotation": 90}
+                x, y = (share, 0.012) if axis == 0 else (0.012, share)
+                axes.text(x, y, thousands(value), transform=axes.transAxes, **turned, **style)
 
 
 def _bar(axes: Axes, image: Any, labels: Sequence[str]) -> None:
@@ -291,7 +329,8 @@ def _table(axes: Axes, rows: Sequence[dict[str, Any]], colours: Sequence[str]) -
 
 
 def _minutes(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 120.0 else f"{int(seconds // 60)} min {int(seconds % 60):02d} s"
+    whole = round(seconds)
+    return f"{whole} s" if whole < 120 else f"{whole // 60} min {whole % 60:02d} s"
 
 
 def _count(number: float) -> str:

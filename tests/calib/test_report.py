@@ -137,7 +137,7 @@ def test_a_contradiction_between_flight_and_held_parameter_is_a_reason(report: R
     verdict = judge(sound(report, considered=considered))
     assert verdict.level is Level.CARE
     assert (
-        "the flight contradicts the held value of torsion: it would change the value by +9000\u00a0µs²"
+        "the flight contradicts the held value of torsion: it would change the value by +9000 ± 1000\u00a0µs²"
         in verdict.sentence
     )
 

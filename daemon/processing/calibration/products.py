@@ -37,6 +37,7 @@ from swath.daemon.processing.calibration.model import in_words, key_of
 from swath.daemon.processing.calibration.record import instruments_of
 from swath.daemon.processing.calibration.run import OUTCOME, Calibrated, CalibrationOptions, paths_of
 from swath.daemon.processing.carried_verdict import Carried, first_lines, verdict_entry
+from swath.daemon.processing.earlier_runs import stale_records
 from swath.daemon.processing.files import sha256_of, write_whole
 from swath.daemon.processing.flights.read import trajectory_verdicts_of
 from swath.daemon.processing.pages.head import NOTHING_KNOWN, PageHead, head_of_flights, headers_words
@@ -99,7 +100,9 @@ def write_products(request: CalibrationOptions, done: Calibrated, tell: Tell) ->
         "carried": verdict_entry(carried, accepted=request.logs.accept_verdict),
     }
     warnings: list[str] = []
+    stale: list[Path] = []
     if request.report is not None:
+        stale = stale_records(request.report / OUTCOME, headers.keys())
         tell("report", 0, 0)
         head = head_of_flights(done.kept.logged, headers_words(headers, verdict.level.words))
         files |= pages(request.report, _with_profiles(report, done), warnings, head)
@@ -109,6 +112,8 @@ def write_products(request: CalibrationOptions, done: Calibrated, tell: Tell) ->
     printed = None if request.report is None else (request.report / REPORT).with_suffix(PRINTED)
     if printed is not None and printed not in files:
         printed.unlink(missing_ok=True)  # of an earlier run
+    for path in stale:
+        path.unlink(missing_ok=True)
     written = [str(path) for path in files]
     lines = calibration_lines(done, report, request.model.ibrc_knots, (before, after), verdict)
     return Told(record | {"files": written}, [*first_lines(record["carried"]), *lines, *written], warnings)

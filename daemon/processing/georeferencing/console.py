@@ -55,7 +55,7 @@ def _strip_line(strip: Mapping[str, Any]) -> str:
 
 def density_words(density: Mapping[str, float]) -> str:
     """Return densities in words: all returns, and last ones if they differ."""
-    every, last = (number(density[key], ".3g") for key in ("all", "last"))
+    every, last = (number(density[key], "#.3g").removesuffix(".") for key in ("all", "last"))
     return f"{every} per m²" + (f" ({last} last returns)" if last != every else "")
 
 

@@ -16,18 +16,21 @@ from swath.calib.validation.courses import Course, ScannerCourse, Step
 from swath.calib.validation.history import date_words
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.files import write_whole
-from swath.daemon.processing.history.run import Collected, csv_text, table_of
+from swath.daemon.processing.history.run import FIRST, Collected, csv_text, table_of
 from swath.daemon.processing.pages.blocks import Block, Card, Image, Judged, Notes, Table, Words, data_uri
 from swath.daemon.processing.pages.head import PageHead
 from swath.daemon.processing.pages.names import HISTORY, HISTORY_TABLE, PRINTED
 from swath.daemon.processing.pages.pdf import page_files
 from swath.daemon.processing.pages.render import Page, html_of
 from swath.daemon.processing.pages.words import INK, MUTED
+from swath.georef.arrays import FloatArray
 from swath.georef.scanner.calibration import INDEX, Calibration
 
 DAY_S = 86_400.0
 DPI = 110
 DAYS_BESIDE = 15.0  # least shown on each side of the dates
+LEAST_APART = 0.015  # of the width; calibrations of one flight have one date
+PARAMETERS_ACROSS = 3  # in a table
 COLOURS = ("#2f6690", "#b3541e", "#4f772d", "#7b4b94", "#9c6b00", "#1f7a8c")  # one a mounting
 HOW = (
     "Points are values with one sigma at the dates of the flights, a colour for each mounting. Successive calibrations "
@@ -70,18 +73,22 @@ def history_page(found: Collected) -> str:
     times = [time for one in found.scanners for time in one.times_s]
     changed = sum(step.changed for one in found.scanners for step in one.steps)
     cards: list[Card] = [
-        (str(len(entries)), "calibrations"),
-        (str(len(found.scanners)), "scanners" if len(found.scanners) > 1 else "scanner"),
-        (str(len({mounting for one in found.scanners for mounting in one.mountings})), "mountings"),
-        (str(changed), "significant changes"),
+        _counted(len(entries), "calibration"),
+        _counted(len(found.scanners), "scanner"),
+        _counted(len({mounting for one in found.scanners for mounting in one.mountings}), "mounting"),
+        _counted(changed, "significant change"),
     ]
-    subtitle = f"{date_words(min(times))[:10]} to {date_words(max(times))[:10]}"
+    subtitle = " to ".join(dict.fromkeys(date_words(time)[:10] for time in (min(times), max(times))))
     heading = ", ".join(one.title for one in found.scanners)
     page = Page(
         "History of calibrations", heading, PageHead(), blocks, cards=cards, subtitle=subtitle,
         appendix=[Words(HOW, "How changes are told")],
     )  # fmt: skip
     return html_of(page)
+
+
+def _counted(count: int, words: str) -> Card:
+    return str(count), words if count == 1 else f"{words}s"
 
 
 def _of_scanner(one: ScannerCourse, *, several: bool) -> Iterator[Block]:
@@ -96,7 +103,7 @@ def _of_scanner(one: ScannerCourse, *, several: bool) -> Iterator[Block]:
     ]
     if steps:
         yield Table(
-            f"{prefix}From one calibration to the next", ("between", "mounted anew", "change"), steps, left=(0, 2)
+            f"{prefix}From one calibration to the next", ("between", "mounted anew", "change"), steps, left=(0, 1, 2)
         )
     rows = [[mounting, *_course_cells(course)] for mounting, courses_of in one.courses.items() for course in courses_of]
     if rows:
@@ -104,7 +111,12 @@ def _of_scanner(one: ScannerCourse, *, several: bool) -> Iterator[Block]:
     for name in one.names:
         words = unknown(f".{name}").words
         yield Image(f"{words} over time", data_uri(picture(one, name), "image/png"), title=f"{prefix}{words}")
-    yield Table(f"{prefix}All calibrations", *table_of(one), left=(0, 1, 2))
+    heads, all_rows = table_of(one)
+    for first in range(FIRST, len(heads), PARAMETERS_ACROSS):  # as many as a sheet of paper holds
+        shown = [0, 1, *([2] if first == FIRST else []), *range(first, min(first + PARAMETERS_ACROSS, len(heads)))]
+        title = f"{prefix}All calibrations" if first == FIRST else ""
+        picked = [[row[column] for column in shown] for row in all_rows]
+        yield Table(title, [heads[column] for column in shown], picked, left=(0, 1, 2) if first == FIRST else (0, 1))
 
 
 def _change_cell(step: Step) -> str | Judged:
@@ -124,13 +136,14 @@ def picture(one: ScannerCourse, name: str) -> bytes:
     axes = figure.subplots()
     named = unknown(f".{name}")
     mountings = list(dict.fromkeys(one.mountings))
+    drawn = _apart(np.array(one.times_s) / DAY_S)  # Matplotlib's dates: days since 1970
     for index, mounting in enumerate(mountings):
         at = [k for k, entry in enumerate(one.entries) if one.mountings[k] == mounting and _sigma(entry, name) > 0.0]
         if not at:
             continue
         values = np.array([one.entries[k].value(name) for k in at]) * named.factor
         sigmas = np.array([_sigma(one.entries[k], name) for k in at]) * named.factor
-        days = np.array([one.times_s[k] for k in at]) / DAY_S  # Matplotlib's dates: days since 1970
+        days = drawn[at]
         axes.errorbar(
             days, values, sigmas, fmt="o-", color=COLOURS[index % len(COLOURS)], capsize=3, lw=1.0, ms=4.5,
             label=mounting,
@@ -141,14 +154,22 @@ def picture(one: ScannerCourse, name: str) -> bytes:
     return made.getvalue()
 
 
+def _apart(days: FloatArray) -> FloatArray:
+    """Move dates (n,) that would cover each other apart, in their order, by a little of the width of the picture."""
+    least = LEAST_APART * max(float(np.ptp(days)), 2.0 * DAYS_BESIDE)
+    moved = days.copy()
+    for at in range(1, len(days)):
+        moved[at] = max(days[at], moved[at - 1] + least)
+    return moved
+
+
 def _style(axes: Axes, label: str, *, legend: bool) -> None:
     axes.set_ylabel(label, fontsize=9, color=INK)
     axes.ticklabel_format(axis="y", useOffset=False)
     axes.tick_params(labelsize=8, colors=MUTED)
     axes.xaxis_date(dt.UTC)
     axes.margins(x=0.08)
-    low, high = axes.get_xlim()
-    if high - low < 2.0 * DAYS_BESIDE:  # of one date alone Matplotlib shows years
+    if axes.dataLim.width < 2.0 * DAYS_BESIDE:  # of one date alone Matplotlib shows years
         middle = (axes.dataLim.x0 + axes.dataLim.x1) / 2.0
         axes.set_xlim(middle - DAYS_BESIDE, middle + DAYS_BESIDE)
     axes.grid(color="#c9cecb", lw=0.4)

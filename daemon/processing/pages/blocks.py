@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, TypeAlias
 
+from swath.georef.verdicts import Verdict
+
 
 @dataclass(frozen=True, slots=True)
 class Words:
@@ -107,6 +109,12 @@ class Image:
     title: str = ""
     words: str = ""
     limited: bool = False
+
+
+def reasons_of(verdict: Verdict) -> list[Block]:
+    """Return a table of the reasons of a verdict with their remedies, without those that its sentence tells wholly."""
+    rows = [[one.what, one.change] for one in verdict.reasons if one.change or one.what not in verdict.sentence]
+    return [Table("Reasons", ("reason", "remedy"), rows, left=(0, 1), stacked=True)] if rows else []
 
 
 Block: TypeAlias = Words | Notes | Table | Image

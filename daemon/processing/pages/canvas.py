@@ -127,7 +127,7 @@ class Panels:
         axes: one per title.
     """
 
-    GAP_IN, LEFT_IN, BOTTOM_IN = 0.62, 0.58, 0.5
+    GAP_IN, LEFT_IN, BOTTOM_IN = 0.62, 0.64, 0.5
 
     def __init__(
         self, canvas: Canvas, titles: Sequence[str], panel_in: float, top: float, columns: int | None = None

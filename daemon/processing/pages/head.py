@@ -65,6 +65,7 @@ class PageHead:
 
 
 NOTHING_KNOWN = PageHead()
+SHORT_NS = 120 * SECOND_NS  # times of shorter flights have seconds
 
 
 def flown_words(spans_ns: Iterable[Span]) -> str:
@@ -72,17 +73,18 @@ def flown_words(spans_ns: Iterable[Span]) -> str:
     spans = list(spans_ns)
     if not spans:
         return ""
-    first, begin = _utc_words(min(begin_ns for begin_ns, _ in spans))
-    last, end = _utc_words(max(end_ns for _, end_ns in spans))
+    begin_ns, end_ns = min(one for one, _ in spans), max(one for _, one in spans)
+    short = end_ns - begin_ns < SHORT_NS
+    (first, begin), (last, end) = _utc_words(begin_ns, seconds=short), _utc_words(end_ns, seconds=short)
     return f"{first}, {begin} to {end} UTC" if first == last else f"{first} {begin} to {last} {end} UTC"
 
 
-def _utc_words(gps_ns: int) -> tuple[str, str]:
-    """Return date and time of day, to the minute, of a GPS time."""
+def _utc_words(gps_ns: int, *, seconds: bool) -> tuple[str, str]:
+    """Return date and time of day of a GPS time, to the minute or the second."""
     day = dt.date.fromordinal(GPS_EPOCH.toordinal() + gps_ns // DAY_NS)
     date, of_day_ns = utc_from_gps(gps_ns, table_leap_seconds(day)[0])
-    minutes = of_day_ns // (60 * SECOND_NS)
-    return date.isoformat(), f"{minutes // 60:02d}:{minutes % 60:02d}"
+    minutes, second = divmod(of_day_ns // SECOND_NS, 60)
+    return date.isoformat(), f"{minutes // 60:02d}:{minutes % 60:02d}" + (f":{second:02d}" if seconds else "")
 
 
 def calibration_words(scanner: str, entry: Mapping[str, Any]) -> str:

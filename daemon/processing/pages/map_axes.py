@@ -73,7 +73,10 @@ def scale_bar(axes: Axes, width_m: float, corner: tuple[float, float] | None = N
     """
     length_m = round_down(0.2 * width_m)
     part, (x, y) = length_m / width_m, corner or (0.025, 0.035)
-    place, thick = axes.transAxes, BAR_IN / _size_in(axes)[1]
+    place, (across_in, up_in) = axes.transAxes, _size_in(axes)
+    thick = BAR_IN / up_in
+    if corner is None:
+        _paper(axes, (x - 0.08 / across_in, y - 0.07 / up_in), (part + 0.16 / across_in, 0.33 / up_in))
     bar = Rectangle((x, y), part, thick, transform=place, fc=INK, ec="white", lw=1.6, zorder=9, clip_on=False)
     bar.set_gid("scale bar")
     axes.add_patch(bar)
@@ -84,6 +87,8 @@ def scale_bar(axes: Axes, width_m: float, corner: tuple[float, float] | None = N
 
 def north_arrow(axes: Axes) -> None:
     """Draw an arrow to grid north in the upper right corner."""
+    across_in, up_in = _size_in(axes)
+    _paper(axes, (0.97 - 0.14 / across_in, 0.985 - 0.55 / up_in), (0.28 / across_in, 0.55 / up_in))
     axes.annotate(
         "N",
         xy=(0.97, 0.975),
@@ -99,6 +104,11 @@ def north_arrow(axes: Axes) -> None:
         path_effects=HALO,
         zorder=11,
     )
+
+
+def _paper(axes: Axes, corner: tuple[float, float], size: tuple[float, float]) -> None:
+    """Draw pale paper below words on a map, so that lines of the map do not cross them; all in parts of the map."""
+    axes.add_patch(Rectangle(corner, *size, transform=axes.transAxes, fc="white", ec="none", alpha=0.72, zorder=8.5))
 
 
 def extents(texts: Iterable[Text], figure: Figure) -> list[Bbox]:

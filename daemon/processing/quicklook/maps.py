@@ -17,6 +17,7 @@ from matplotlib.ticker import FuncFormatter, MaxNLocator
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from swath.calib.labels import number
 from swath.daemon.processing.pages.classes import (
     DZ_LIMITS_M,
     SHARE_INSIDE,
@@ -118,8 +119,8 @@ class MapPage:
     def outlines(self, *, light: bool = False) -> None:
         """Draw the outlines of the strips with their names."""
         look, units = self.look, self.look.units
-        for number in range(min(len(look.strips), MOST_OUTLINES)):
-            coverage = look.cells.coverage(number)
+        for index in range(min(len(look.strips), MOST_OUTLINES)):
+            coverage = look.cells.coverage(index)
             there = ndimage.binary_closing(np.pad(coverage.there, 3), iterations=2, structure=np.ones((3, 3)))
             there = ndimage.binary_fill_holes(there)
             if not there.any():
@@ -127,7 +128,7 @@ class MapPage:
             frame = coverage.frame
             east_m = frame.west_m + (np.arange(there.shape[1]) - 2.5) * frame.cell_m
             north_m = frame.south_m + (np.arange(there.shape[0]) - 2.5) * frame.cell_m
-            colour = "white" if light else look.colours[number]
+            colour = "white" if light else look.colours[index]
             shape = ndimage.gaussian_filter(there.astype(float), 0.7)
             self.axes.contour(
                 east_m / units.east_m, north_m / units.north_m, shape, [0.4], colors=[colour], linewidths=0.9, zorder=3
@@ -137,8 +138,8 @@ class MapPage:
     def _names(self) -> None:
         """Write the strips' names where they overlap nothing; a strip that has no such place stays unnamed."""
         look, names = self.look, []
-        for number, strip in enumerate(look.strips if self.named else []):
-            places_m = look.cells.coverage(number).centres()
+        for index, strip in enumerate(look.strips if self.named else []):
+            places_m = look.cells.coverage(index).centres()
             if not len(places_m):
                 continue
             middle, axis = axis_of(places_m)
@@ -149,7 +150,7 @@ class MapPage:
             text = self.axes.text(
                 *places[0],
                 shortened(strip.name, 24),
-                color=look.colours[number],
+                color=look.colours[index],
                 fontsize=8.5,
                 weight="bold",
                 ha="center",
@@ -275,7 +276,7 @@ def draw_sigma(look: Look, path: Path) -> None:
     page.finish(path)
 
 
-def draw_differences(look: Look, path: Path) -> None:
+def draw_differences(look: Look, path: Path, title: str = "Height difference of overlapping strips") -> None:
     """Draw differences of overlapping strips in smooth cells, by size, over the shaded ground.
 
     Each is the mean of so many cells around it that the map shows the pattern and not the noise.
@@ -283,7 +284,7 @@ def draw_differences(look: Look, path: Path) -> None:
     frame, overlap = look.cells.frame, look.overlap
     numbers = overlap.numbers()
     assert numbers is not None
-    page = MapPage(look, "Height difference of overlapping strips", _difference_words(look), WIDE_SIDE_IN)
+    page = MapPage(look, title, _difference_words(look), WIDE_SIDE_IN)
     _pale_ground(page)
     size = np.abs(overlap.shown_m).astype(float)
     limits = limits_for(float(np.nanquantile(size, SHARE_INSIDE)))
@@ -328,7 +329,7 @@ def _worst_pairs(look: Look) -> str:
     """Return lines on the pairs whose medians are farthest from zero."""
     rows = sorted(look.overlap.rows, key=lambda row: -abs(row["median_m"]))[:4]
     names = [f"{shortened(look.names[row['first']], 10)} − {shortened(look.names[row['second']], 10)}" for row in rows]
-    lines = [f"{name}:  {thousands(100 * row['median_m'], 1)} cm" for name, row in zip(names, rows, strict=True)]
+    lines = [f"{name}:  {number(100 * row['median_m'], '+.1f')} cm" for name, row in zip(names, rows, strict=True)]
     return "\n".join(["medians" if len(rows) == len(look.overlap.rows) else "largest medians", *lines])
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from swath.calib.labels import number
 from swath.calib.strips.standards import ASPRS_OVERLAP, QUALITY_LEVELS, TO_CONFIRM, USGS
 from swath.daemon.processing.files import write_whole
 from swath.daemon.processing.pages.blocks import Block, Card, Cell, Image, Judged, Notes, Table, Words, data_uri
@@ -50,8 +51,8 @@ def make_page(look: Look, folder: Path, title: str, warnings: list[str], tell: T
         OSError: the folder cannot be written to.
     """
     shown = []
-    for number, (name, alt, draw, wanted) in enumerate(PICTURES):
-        tell("pictures", number, len(PICTURES), "pictures")
+    for index, (name, alt, draw, wanted) in enumerate(PICTURES):
+        tell("pictures", index, len(PICTURES), "pictures")
         path = folder / f"{name}.png"
         if wanted(look):
             draw(look, path)
@@ -71,7 +72,7 @@ def page_of(look: Look, title: str, pictures: Sequence[Image]) -> str:
         head_of_sidecars((source.sidecar for source in look.sources), crs_of(source.crs for source in look.sources)),
         [*_notes(look), *pictures, *_quality(look), *_pairs(look), _strips(look), _files(look)],
         cards=_cards(look),
-        appendix=[_method(look), *_sidecars(look)],
+        appendix=[*([_method(look)] if look.overlap.rows else []), *_sidecars(look)],
     )
     return html_of(page)
 
@@ -88,7 +89,7 @@ def _cards(look: Look) -> list[Card]:
         words = f"RMSDz of strips, planes in cells of {agreement.cell_m:g} m"
         cards.append((f"{100 * agreement.numbers['rms_m']:.1f} cm", words))
         level = agreement.best or ("none" if agreement.judged else "no verdict")
-        cards.append((level, "best quality level kept"))
+        cards.append((level, "best quality level met"))
     sigma_m = _root_mean_square(look)
     if sigma_m is not None:
         cards.append((f"{100 * sigma_m:.1f} cm", "sigma of height"))
@@ -104,7 +105,7 @@ def _root_mean_square(look: Look) -> float | None:
 
 
 def _area(area_m2: float) -> str:
-    return f"{area_m2 / 1e6:.3g} km²" if area_m2 >= 1e5 else f"{thousands(area_m2)} m²"
+    return f"{number(area_m2 / 1e6, '#.3g').removesuffix('.')} km²" if area_m2 >= 1e5 else f"{thousands(area_m2)} m²"
 
 
 def _notes(look: Look) -> list[Block]:
@@ -128,8 +129,8 @@ def _sigma_cm(sigma_m: float) -> str:
 
 
 def _kept(limit: str, kept: bool | None) -> Cell:
-    """Return a limit, with whether it is kept if that is known."""
-    return limit if kept is None else Judged(f"{limit}{' kept' if kept else ' not kept'}", kept)
+    """Return a limit, with whether it is met if that is known."""
+    return limit if kept is None else Judged(f"{limit}{' met' if kept else ' not met'}", kept)
 
 
 def _quality(look: Look) -> list[Block]:
@@ -157,11 +158,10 @@ def _quality(look: Look) -> list[Block]:
     heads = ["measure", "measured", *(level.name for level in QUALITY_LEVELS)]
     verdicts = " ".join(f"{line}." for line in agreement.verdicts() if line != TO_CONFIRM)
     words = (
-        f"{agreement.measure}. Density: first returns per m² where cells are "
-        "covered wholly, all strips together. Single cars or leaves decide over a largest |dZ|, so 99 % of the cells "
-        f"must keep its limit. ASPRS asks for an RMSDz between swaths of at most {ASPRS_OVERLAP:g} × the vertical "
-        f"accuracy class. {TO_CONFIRM[0].upper()}{TO_CONFIRM[1:]}. Absolute accuracy wants check points; nothing here "
-        "says it."
+        f"{agreement.measure}. Density: first returns per m² where cells are covered wholly, all strips together. 99 % "
+        "of the cells must meet the limit of |dZ|, because single cars or leaves cause the largest of all. ASPRS asks "
+        f"for an RMSDz between swaths of at most {ASPRS_OVERLAP:g} × the vertical accuracy class. "
+        f"{TO_CONFIRM[0].upper()}{TO_CONFIRM[1:]}. Absolute accuracy is not judged here: it needs check points."
     )
     return [_table("Quality levels", heads, rows), Words(verdicts), Words(words, muted=True)]
 
@@ -188,8 +188,8 @@ def _pairs(look: Look) -> list[Block]:
         [
             f"{look.names[row['first']]} − {look.names[row['second']]}",
             f"{thousands(row['cells'])}{' (few)' if row['cells'] < FEW_CELLS else ''}",
-            thousands(100 * row["median_m"], 1),
-            thousands(100 * row["mean_m"], 1),
+            number(100 * row["median_m"], "+.1f"),
+            number(100 * row["mean_m"], "+.1f"),
             f"{100 * row['rms_m']:.1f}",
             f"{100 * row['p95_m']:.1f}",
             f"{100 * row['max_m']:.1f}",

@@ -13,6 +13,7 @@ from pyproj import CRS
 Json = dict[str, Any]
 LARGEST_BYTES = 50_000_000
 MOST_FILES = 50
+UNITS = {"deg": "°", "m": " m", "c": " °C", "hpa": " hPa", "percent": " %", "ppm": " ppm", "s": " s"}  # ends of keys
 CRS_KEYS = ("crs", "name", "heights", "datum", "realisation", "epoch", "operation", "accuracy_m", "grids")
 
 
@@ -111,11 +112,17 @@ def rows_of(sidecar: Json) -> list[tuple[str, str]]:
     crs = sidecar.get("crs")
     if isinstance(crs, dict):
         crs_rows = [(key, crs[key]) for key in CRS_KEYS if crs.get(key) not in (None, [], "")]
-        rows += [(f"CRS: {key.replace('_', ' ')}", _text(value)) for key, value in crs_rows]
+        rows += [_crs_row(key, value) for key, value in crs_rows]
     counts = sidecar.get("counts")
     if isinstance(counts, dict):
         rows += [(f"returns of {name}", _text(value)) for name, value in counts.items()]
     return rows
+
+
+def _crs_row(key: str, value: Any) -> tuple[str, str]:
+    if key == "accuracy_m" and isinstance(value, int | float):
+        return "CRS: accuracy", f"{_text(value)} m"
+    return ("CRS" if key == "crs" else f"CRS: {key.replace('_', ' ')}"), _text(value)
 
 
 def _distinct(values: Iterator[Any]) -> list[Any]:
@@ -124,6 +131,14 @@ def _distinct(values: Iterator[Any]) -> list[Any]:
         if value and value not in found:
             found.append(value)
     return found
+
+
+def _named(key: str, value: Any) -> str:
+    """Return a key and its value in words; the unit at the key's end stands behind the number."""
+    words, _, ending = key.rpartition("_")
+    if words and ending in UNITS and isinstance(value, int | float) and not isinstance(value, bool):
+        return f"{words.replace('_', ' ')} {_text(value)}{UNITS[ending]}"
+    return f"{key.replace('_', ' ')} {_text(value)}"
 
 
 def _text(value: Any) -> str:
@@ -135,7 +150,7 @@ def _text(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, dict):
-        return ", ".join(f"{str(key).replace('_', ' ')} {_text(one)}" for key, one in value.items()) or "none"
+        return ", ".join(_named(str(key), one) for key, one in value.items()) or "none"
     if isinstance(value, list):
         return ", ".join(_text(one) for one in value) or "none"
     return str(value)

@@ -215,9 +215,12 @@ class Judgement:
         """Return the gravest reason, and how well the strips agree."""
         numbers, words = self.agreement.numbers, [reasons[0].what] if reasons else []
         if numbers is not None:
-            met = f", and meet {self.agreement.best}" if self.agreement.best else ", and meet no quality level"
-            met = met if self.agreement.judged else ""
-            words.append(f"strips agree to {100.0 * numbers['rms_m']:.1f} cm (RMSDz of {len(self.pairs())} pairs){met}")
+            best, judged = self.agreement.best, bool(self.agreement.judged)
+            met = "" if not judged else f", and meet {best}" if best else ", and meet no quality level"
+            verb = "differ by" if judged and not best else "agree to"
+            count = len(self.pairs())
+            pairs = f"{count} pairs" if count != 1 else "one pair"
+            words.append(f"strips {verb} {100.0 * numbers['rms_m']:.1f} cm (RMSDz of {pairs}){met}")
         return "; ".join(words)
 
     def strip_rows(self) -> list[StripRow]:

@@ -10,10 +10,7 @@ from swath.daemon.processing.strips.compare import WORST_PAIRS, Compared, Judgem
 
 PAIR_HEADS = ("cells", "mean", "RMSDz", "95 %", "max", "to plane", "RMS", "noise")
 STRIP_HEADS = ("pairs", "cells", "above", "RMSDz", "scatter", "per m²")
-TO_PLANE = "to plane: single returns above the other strip's plane, RMS along its normal, all slopes to 45°"
-OF_STRIPS = (
-    "above: mean height above the other strips; scatter: of single returns about their planes, smoothest quarter"
-)
+WORDS = "above: mean height over the other strips; scatter: of single returns; to plane: of returns, slopes to 45°"
 
 
 def comparison_lines(done: Compared, level: str | None, *, all_pairs: bool = False) -> list[str]:
@@ -30,11 +27,10 @@ def comparison_lines(done: Compared, level: str | None, *, all_pairs: bool = Fal
         *_change_lines(now, done.before),
         *_strip_lines(now),
         *_pair_lines(now, len(now.pairs()) if all_pairs else WORST_PAIRS),
-        now.agreement.measure,
-        OF_STRIPS,
-        TO_PLANE,
         *_effect_lines(now),
         *(now.agreement.verdicts() if now.agreement.judged else []),
+        now.agreement.measure,
+        WORDS,
         *now.strips.notes,
     ]
 
@@ -87,7 +83,12 @@ def _pair_line(name: str, heights: dict[str, Any] | None, to_plane: PairReport |
 
 def _effect_lines(now: Judgement) -> list[str]:
     """Return what the differences look like, without the effects that the verdict names."""
-    return [] if now.signatures is None else [line for line in now.signatures.lines if line not in now.wrong()]
+    if now.signatures is None:
+        return []
+    lacking = [one.effect.name for one in now.signatures.found if one.level == "not told"]
+    lines = [one for one in now.signatures.lines if one not in now.wrong()]
+    told = [one for one in lines if one.partition(":")[0] not in lacking]
+    return [*told, *([f"not determined by these strips: {', '.join(lacking)}"] if lacking else [])]
 
 
 def _cm(metres: float | None, *, sign: bool = False) -> str:

@@ -13,7 +13,18 @@ from swath.calib.strips.standards import TO_CONFIRM
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.earlier_runs import listed_files, relative_to
 from swath.daemon.processing.files import aside_folder, write_whole
-from swath.daemon.processing.pages.blocks import Block, Card, Cell, Image, Judged, Notes, Table, Words, data_uri
+from swath.daemon.processing.pages.blocks import (
+    Block,
+    Card,
+    Cell,
+    Image,
+    Judged,
+    Notes,
+    Table,
+    Words,
+    data_uri,
+    reasons_of,
+)
 from swath.daemon.processing.pages.names import STRIPS, STRIPS_PICTURES
 from swath.daemon.processing.pages.pdf import page_files
 from swath.daemon.processing.pages.render import Page, html_of
@@ -48,8 +59,9 @@ def write_comparison(done: Compared, folder: Path, level: str | None, warnings: 
             maps = []
             for name, title, one in zip(STRIPS_PICTURES, MAP_TITLES, (done.now, done.before), strict=True):
                 if one is not None:
-                    draw_differences(one.strips.look, aside / name)
-                    maps.append((title if done.before is not None else MAP_TITLE, aside / name))
+                    title = title if done.before is not None else MAP_TITLE
+                    draw_differences(one.strips.look, aside / name, title)
+                    maps.append((title, aside / name))
             files = page_files(aside / STRIPS, strips_page(done.now, done.before, level, maps), warnings)
             shown = [folder / path.name for path in (*files, *(path for _, path in maps))]
             pictures = [str(folder / path.name) for _, path in maps]
@@ -73,9 +85,8 @@ def strips_page(now: Judgement, before: Judgement | None, level: str | None, map
         maps: titles and files of the maps of differences.
     """
     verdict = now.verdict(level)
-    reasons = [[reason.what, reason.change] for reason in verdict.reasons]
     blocks: list[Block] = [
-        *([Table("Reasons", ("what", "remedy"), reasons, left=(0, 1), stacked=True)] if reasons else []),
+        *reasons_of(verdict),
         *_notes(now),
         *_change(now, before),
         _strips(now),

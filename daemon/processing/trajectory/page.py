@@ -70,8 +70,8 @@ def _determines(drawn: Drawn, *names: str) -> bool:
 PICTURES: tuple[tuple[str, str, Callable[[Drawn, Format], bytes], Wanted], ...] = (
     (
         "Map",
-        "Positions used, by fix type; where none was used for long, grey. Numbers: straight flight, of which swath "
-        "georef makes strips where the laser was on.",
+        "Colour: fix type of the positions used; grey: none was used for long. Numbers: straight flight; swath georef "
+        "makes strips of it where the laser was on.",
         draw_map,
         _always,
     ),
@@ -224,7 +224,10 @@ def _cards(figures: Figures) -> list[Card]:
         (_length(place[2]), "sigma, vertical"),
         (f"{_sigma_number(rms['heading_deg'])}°", "sigma of heading"),
         (thousands(positions["used"]), "positions used"),
-        (str(positions["outages"]), f"outages, longest {_duration(positions['longest_outage_s'])}"),
+        (
+            str(positions["outages"]),
+            f"outages, longest {_duration(positions['longest_outage_s'])}" if positions["outages"] else "outages",
+        ),
     ]
 
 
@@ -324,21 +327,30 @@ def _estimated_words(value: float, sigma: float) -> tuple[str, str]:
     return _number(value, pattern), _number(sigma, pattern)
 
 
+def _fix_words(name: str) -> str:
+    """Return the name of a fix type, alone or within other words, for people."""
+    return name.replace("_", " ").replace("rtk", "RTK").replace("ppp", "PPP")
+
+
 def _run(figures: Figures) -> Table:
     bridged, positions, separation = figures["bridged"], figures["positions"], figures["separation"] or {}
+    shown = {f"{kind}_{fate}" for kind in figures["observations"] for fate in FATES}  # in the table of observations
     rows = [
         ["inertial samples made up", f"{thousands(bridged['epochs'])} ({share(bridged['share'])})"],
         ["longest run of them", _duration(bridged["longest_s"])],
         ["time in outages", _duration(positions["outages_s"])],
-        *([f"positions, {name.replace('_', ' ')}", thousands(n)] for name, n in positions["fix_types"].items()),
+        *([f"positions, {_fix_words(name)}", thousands(n)] for name, n in positions["fix_types"].items()),
         ["satellites, median", _number(positions["satellites_median"])],
         *([f"filter − smoother / sigma, {name}", _number(value, ".2f")] for name, value in separation.items()),
-        *([f"noise found, {name}", f"× {_number(value)}"] for name, value in figures["noise_found"].items()),
+        *(
+            [f"noise found, {_fix_words(name)}", f"× {_number(value, '.2f')}"]
+            for name, value in figures["noise_found"].items()
+        ),
         ["share of positions' variance that lasts", _number(figures["lasting_share"], ".2f")],
         ["share of velocities' variance that lasts", _number(figures["lasting_velocity_share"], ".2f")],
         ["how long velocities' errors last, s", _number(figures["lasting_velocity_s"], ".1f")],
         ["share of headings' variance that lasts", _number(figures["lasting_heading_share"], ".2f")],
         ["how long headings' errors last, s", _number(figures["lasting_heading_s"], ".1f")],
-        *([name.replace("_", " "), thousands(count)] for name, count in figures["counts"].items()),
+        *([name.replace("_", " "), thousands(count)] for name, count in figures["counts"].items() if name not in shown),
     ]
     return Table("The run", ("", ""), [row for row in rows if row[1] != "–"])

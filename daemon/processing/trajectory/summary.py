@@ -112,11 +112,11 @@ def _mapping_of(flight: Navigated) -> Mapping | None:
 
 def start_words(start: Start) -> str:
     """Return in words how a leg's start was found, and its attitude."""
-    how = getattr(start, "text", "")
+    how = str(getattr(start, "text", "")).partition(":")[0]  # behind it stand the sigmas again
     roll, pitch, heading = np.degrees(start.attitude_rad)
     sigma = np.degrees(start.attitude_sigma_rad)
-    angles = f"roll {roll:.2f}°, pitch {pitch:.2f}°, heading {heading % 360.0:.2f}°"
-    return f"{how}{'; ' if how else ''}{angles}, to {max(sigma[:2]):.2f}° and {sigma[2]:.2f}°"
+    angles = f"roll {roll:.2f}° and pitch {pitch:.2f}° (± {max(sigma[:2]):.2f}°), heading {heading % 360.0:.2f}°"
+    return f"{how}{'; ' if how else ''}{angles} (± {sigma[2]:.2f}°)".replace("-", "−")
 
 
 def summary_head(

@@ -6,11 +6,31 @@ from collections.abc import Iterable, Sequence
 
 from scipy import stats
 
-from swath.calib.labels import decimals_of, number, thousands, words_of
+from swath.calib.labels import decimals_of, number, p_words, thousands, words_of
 from swath.calib.validation.history import History
-from swath.calib.validation.methods import ALPHA, POWER, WANTS, WORDS, Detectable, Method, Test, Validation
+from swath.calib.validation.methods import (
+    ALPHA,
+    POWER,
+    WANTS,
+    WORDS,
+    Detectable,
+    Method,
+    Test,
+    Validation,
+)
 from swath.daemon.processing.carried_verdict import Carried
-from swath.daemon.processing.pages.blocks import Block, Card, Cell, Image, Judged, Notes, Table, Words, data_uri
+from swath.daemon.processing.pages.blocks import (
+    Block,
+    Card,
+    Cell,
+    Image,
+    Judged,
+    Notes,
+    Table,
+    Words,
+    data_uri,
+    reasons_of,
+)
 from swath.daemon.processing.pages.head import PageHead
 from swath.daemon.processing.pages.render import Page, html_of
 from swath.georef.scanner.calibration import INDEX, PARAMETERS
@@ -27,7 +47,6 @@ TESTS = {
     "effects": "χ² of the part that errors of the calibration explain",
     "effect": "largest single error, in sigmas",
 }
-LEAST_P = 1e-6
 HOW = (
     "Every distance is tested against its expected covariance: noise of the planes, errors of the trajectory with "
     "their correlation along the strips, and the sigmas of the calibration itself. A test fails where chance alone "
@@ -56,9 +75,8 @@ def validation_page(
         picture: PNG of the histories; None: there are none.
     """
     verdict = verdict_of(validation, histories, carried)
-    reasons = [[reason.what, reason.change] for reason in verdict.reasons]
     blocks: list[Block] = [
-        *([Table("Reasons", ("what", "remedy"), reasons, left=(0, 1), stacked=True)] if reasons else []),
+        *reasons_of(verdict),
         *_notes(notes, validation),
         *([] if validation is None else [*_methods(validation), *_detectable(validation)]),
         *_histories(histories, picture),
@@ -73,7 +91,7 @@ def verdict_of(validation: Validation | None, histories: Sequence[History], carr
     reasons = [one.reason for one in carried]
     words = []
     if validation is not None:
-        words.append(validation.sentence)
+        words.append(validation.summary)
         failed = [method for method in validation.methods if method.passed is False]
         remedy = "calibrate again; until then do not use the calibration"
         reasons += [Reason(Level.UNUSABLE, one.name, _failure(one), remedy, 2.0) for one in failed]
@@ -94,7 +112,8 @@ def verdict_of(validation: Validation | None, histories: Sequence[History], carr
 
 def _notes(notes: Sequence[str], validation: Validation | None) -> list[Block]:
     """Return the notes that are not among the reasons."""
-    shown = [note for note in notes if validation is None or note not in validation.dependent]
+    shown = [note for note in notes if "--record" not in note]  # how to call the command again is no reader's matter
+    shown = [note for note in shown if validation is None or note not in validation.dependent]
     return [Notes(shown)] if shown else []
 
 
@@ -155,7 +174,7 @@ def _figures(test: Test) -> list[str]:
     """Return figure, limit and p of a test."""
     digits, limit = 0 if abs(test.value) >= 100.0 else 1, _limit(test)
     most = "–" if limit is None else f"≤ {thousands(limit, digits)}"
-    return [thousands(abs(test.value), digits), most, f"< {LEAST_P:g}" if test.p < LEAST_P else number(test.p, ".2g")]
+    return [thousands(abs(test.value), digits), most, p_words(test.p).removeprefix("p ")]
 
 
 def _limit(test: Test) -> float | None:
@@ -186,23 +205,22 @@ def _detectable(validation: Validation) -> list[Block]:
     """Return a table of the smallest errors that the tests would have detected."""
     found = validation.detectable
     several = len({one.scanner for one in found}) > 1
-    rows = [[words_of(one.scanner, one.parameter, several=several), *_size(one)] for one in found]
+    rows = [[words_of(one.scanner, one.parameter, several=several), _size(one)] for one in found]
     under = (
         f"A single error of this size would have failed a test with a probability of {100 * POWER:.0f} %; "
         "smaller ones may remain unseen."
     )
-    heads = ("parameter", "smallest error that would be detected", "unit")
-    return [Table("What would have been seen", heads, rows, under, left=(0, 2))] if rows else []
+    return [Table("Smallest errors that would be detected", ("parameter", "error"), rows, under)] if rows else []
 
 
-def _size(one: Detectable) -> tuple[str, str]:
+def _size(one: Detectable) -> str:
     parameter = PARAMETERS[INDEX[one.parameter]]
     ending = parameter.key.rpartition("_")[2]
     unit = {"deg": "°", "us": "µs", "us2": "µs²"}.get(ending, ending)
     if not one.seen:
-        return "none would be", unit
+        return "none would be detected"
     size = one.size / parameter.factor
-    return number(size, f".{decimals_of(size)}f"), unit
+    return f"{number(size, f'.{decimals_of(size)}f')}{'' if unit == '°' else ' '}{unit}"
 
 
 def _histories(histories: Iterable[History], picture: bytes | None) -> list[Block]:

@@ -137,7 +137,7 @@ def test_record_and_table_show_the_numbers_of_a_lifted_strip(
 
 def test_the_page_begins_with_the_verdict_and_shows_strips_pairs_and_the_map(tmp_path: Path) -> None:
     folder = lifted(tmp_path / "now", 0.07)
-    with pytest.raises(UserError, match="do not meet QL1"):
+    with pytest.raises(UserError):
         run(str(folder), "-o", str(tmp_path / "out"), "--level", "QL1")
     text = (tmp_path / "out" / "strips.html").read_text(encoding="utf-8")
     sentence = "Not to be used: strips do not meet QL1, because of its limit of 8 pulses per m²; strips agree to 7.0 cm"
@@ -211,12 +211,19 @@ def test_numbers_before_and_after_are_shown_side_by_side(tmp_path: Path, capsys:
     assert "overlapping strips, before" in text
 
 
-def test_a_missed_quality_level_is_a_problem(tmp_path: Path) -> None:
+def test_a_missed_quality_level_is_a_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Standard output has the verdict, and stderr does not repeat it; beside JSON it is the only line for people."""
     folder = lifted(tmp_path / "now", 0.12)
     run(str(folder), "--level", "QL3")
-    with pytest.raises(UserError, match=r"strips do not meet QL2, because of its limit of 0\.08 m RMSDz") as caught:
-        run(str(folder), "--level", "QL2")
+    said = "strips do not meet QL2, because of its limit of 0.08 m RMSDz"
+    with pytest.raises(UserError, match=re.escape(said)) as caught:
+        run(str(folder), "--level", "QL2", "--json")
     assert caught.value.exit_code == ExitCode.PROBLEM
+    capsys.readouterr()
+    with pytest.raises(UserError) as caught:
+        run(str(folder), "--level", "QL2")
+    assert (caught.value.message, caught.value.exit_code) == ("", ExitCode.PROBLEM)
+    assert said in capsys.readouterr().out.splitlines()[0]
 
 
 @pytest.mark.slow

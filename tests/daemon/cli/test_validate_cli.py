@@ -94,13 +94,13 @@ def test_a_history_without_testable_parameters_is_a_problem(tmp_path: Path) -> N
     with pytest.raises(
         UserError, match="drift cannot be tested, because fewer than two calibrations have sigmas"
     ) as caught:
-        run(str(first), "--history", str(first))
+        run(str(first), "--history", str(first), "--json")
     assert caught.value.exit_code == ExitCode.PROBLEM
     second = file_of(tmp_path / "c2.toml", boresight(0.1).changed(scan_plane_tilt_rad=1e-3), 2)
     with pytest.raises(
         UserError, match="the step between 2026-01-01 and 2026-02-01 was not tested: scan_plane_tilt_deg, held"
     ):
-        run(str(second), "--history", str(first))
+        run(str(second), "--history", str(first), "--json")
 
 
 # ---------------------------------------------------------------------- logs
@@ -154,7 +154,7 @@ def test_an_unusable_trajectory_is_the_first_line_and_a_problem(
 
     monkeypatch.setattr(validate_run, "read_flight", judged)
     arguments = (str(file_of(tmp_path / "good.toml", boresight(0.0))), str(log))
-    with pytest.raises(UserError, match=r"^not to be used: navigated trajectory: lever arm; use --accept-verdict"):
+    with pytest.raises(UserError, match=r'^the verdict is "not to be used"; use --accept-verdict to accept it$'):
         run(*arguments)
     assert capsys.readouterr().out.splitlines()[0] == "not to be used: navigated trajectory: lever arm"
     run(*arguments, "--accept-verdict")
@@ -172,9 +172,15 @@ def test_a_true_calibration_passes(log: Path, tmp_path: Path, capsys: pytest.Cap
     assert passed["secondAltitude"] is None
 
 
-def test_a_wrong_calibration_fails(log: Path, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match=r"the calibration does not hold: .*other") as caught:
-        run(str(file_of(tmp_path / "bad.toml", boresight(0.04))), str(log))
+def test_a_wrong_calibration_fails(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = [str(file_of(tmp_path / "bad.toml", boresight(0.04))), str(log)]
+    with pytest.raises(UserError, match=r"the calibration does not hold: (\d) of \1 methods failed$"):
+        run(*arguments, "--json")
+    capsys.readouterr()
+    with pytest.raises(UserError) as caught:
+        run(*arguments)
+    assert caught.value.message == ""  # standard output has said it
+    assert "the calibration does not hold: " in capsys.readouterr().out
     assert caught.value.exit_code == ExitCode.PROBLEM
 
 
@@ -347,7 +353,7 @@ def test_parameters_that_cannot_be_remeasured_are_a_problem(
     with pytest.raises(
         UserError, match="independently measured parameters: the adjustment does not converge"
     ) as caught:
-        run(str(file_of(tmp_path / "good.toml", boresight(0.0))), str(log), "--anew")
+        run(str(file_of(tmp_path / "good.toml", boresight(0.0))), str(log), "--anew", "--json")
     assert caught.value.exit_code == ExitCode.PROBLEM
 
 
@@ -357,7 +363,7 @@ def test_an_untestable_history_is_a_problem_even_if_logs_agree(log: Path, tmp_pa
     with pytest.raises(
         UserError, match="drift cannot be tested, because fewer than two calibrations have sigmas"
     ) as caught:
-        run(str(good), str(log), "--history", str(other))
+        run(str(good), str(log), "--history", str(other), "--json")
     assert caught.value.exit_code == ExitCode.PROBLEM
 
 

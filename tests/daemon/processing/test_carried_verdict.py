@@ -15,6 +15,7 @@ from swath.calib.prealign import PrealignError
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.carried_verdict import (
     Carried,
+    acceptance,
     calibration_verdicts,
     file_verdicts,
     first_lines,
@@ -156,6 +157,8 @@ def test_the_worst_verdict_comes_first_and_only_an_unusable_one_is_a_problem() -
     entry = verdict_entry([care, bad], accepted=False)
     assert first_lines(entry) == ["not to be used: b", "usable with care: a"]
     assert refusal(entry) == "not to be used: b; use --accept-verdict to accept it"
+    assert acceptance(entry) == 'the verdict is "not to be used"; use --accept-verdict to accept it'
+    assert acceptance(verdict_entry([care, bad], accepted=True)) == ""
     assert refusal(verdict_entry([care, bad], accepted=True)) == ""
     assert refusal(verdict_entry([care], accepted=False)) == ""
     assert verdict_entry([], accepted=False) == {"level": "good", "reasons": [], "accepted": False}

@@ -10,7 +10,7 @@ import pytest
 
 from swath.daemon.cli.main import run_app
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.processing.earlier_runs import listed_files, refuse_existing, relative_to, stale_pages
+from swath.daemon.processing.earlier_runs import listed_files, refuse_existing, relative_to, stale_pages, stale_records
 from swath.daemon.processing.files import aside_folder
 from tests.daemon.one_line import Flown, fly
 
@@ -30,6 +30,17 @@ def viewed(flown: Flown, tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert run_app(flown.arguments(folder)) == 0
     assert run_app(["view", str(folder)]) == 0
     return folder
+
+
+def test_records_of_scanners_that_are_gone_are_found_by_their_ids(tmp_path: Path) -> None:
+    outcome = tmp_path / "calibration.json"
+    outcome.write_text(json.dumps({"calibrations": {"left": "L-1", "right": "R-1", "../up": "U-1", "rear": "B-1"}}))
+    for name, identity in (("left", "L-1"), ("right", "R-1"), ("rear", "of another run")):
+        (tmp_path / f"{name}.record.json").write_text(json.dumps({"id": identity}))
+        (tmp_path / f"{name}.record.npz").touch()
+    found = stale_records(outcome, {"left"})
+    assert sorted(path.name for path in found) == ["right.record.json", "right.record.npz"]
+    assert stale_records(tmp_path / "none.json", {"left"}) == []
 
 
 def test_view_replaces_its_page_only_if_asked(viewed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

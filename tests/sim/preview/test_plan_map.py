@@ -73,6 +73,33 @@ def test_the_axes_of_the_map_bear_the_coordinates_of_the_crs(monkeypatch: pytest
         assert [number(text) for _, text in shown] == [tick for tick, _ in shown]
 
 
+def test_small_maps_bear_the_coordinates_of_the_crs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each coordinate stands at the edge where the line of this easting or northing meets it."""
+    lines = line("a", "-500.0, 0.0", "500.0, 0.0"), line("b", "0.0, -500.0", "0.0, 500.0")
+    figure, chart = drawn(FLAT + "".join(lines), monkeypatch), Chart(Survey(flat_plan(*lines)))
+    maps = [axes for axes in figure.axes if not axes.get_xlabel() and axes.images and len(axes.get_xticks()) == 0]
+    assert len(maps) == 2
+    for axes in maps:
+        words = [text for text in axes.texts if "\u202f" in text.get_text()]
+        upright = [text.get_rotation() == 90.0 for text in words]
+        assert True in upright
+        assert False in upright
+        for text in words:
+            x, y = axes.transData.inverted().transform(axes.transAxes.transform(text.get_position()))
+            edge = [axes.get_xlim()[0], y] if text.get_rotation() else [x, axes.get_ylim()[0]]
+            place = chart.place(np.array([edge]))[0][int(text.get_rotation() == 90.0)]
+            assert number(text.get_text()) == pytest.approx(place, abs=2.0)
+
+
+def test_names_of_lines_that_begin_at_one_place_do_not_overlap(monkeypatch: pytest.MonkeyPatch) -> None:
+    ends = [("500.0, 0.0", "-500.0, 0.0"), ("500.0, 20.0", "-500.0, 20.0"), ("-500.0, 10.0", "500.0, 10.0")]
+    names = ["low-west-aside", "high-west-aside", "low-east"]
+    lines = [line(name, *both) for name, both in zip(names, ends, strict=True)]
+    figure = drawn(FLAT + "".join(lines), monkeypatch)
+    assert set(names) <= {text.get_text() for text in texts_of(figure)}
+    assert overlapping(figure) == []
+
+
 @pytest.mark.parametrize("lines", [1, 12])
 def test_no_texts_overlap(lines: int, monkeypatch: pytest.MonkeyPatch) -> None:
     figure = drawn(FLAT + "".join(parallel(lines)), monkeypatch)

@@ -92,7 +92,9 @@ def _block(content: Content, form: Format, narrow: Format | None) -> Block:
 def contents_of(report: ReportInput, verdict: Verdict) -> list[Content]:
     """Return all that stands below the cards."""
     several = len(report.adjusted.calibrations) > 1
-    notes = [plain(line, several=several) for line in (*report.notes, *report.adjusted.notes)]
+    told = report.settings.get("trajectory errors", "").split("; ")  # stand with the settings
+    every = (*report.notes, *report.adjusted.notes)
+    notes = [plain(line, several=several) for line in every if line not in told]
     found: list[Content | None] = [
         _identity(report),
         _reasons(verdict),
@@ -158,11 +160,9 @@ def _identity(report: ReportInput) -> Table | None:
     for scanner, header in report.headers.items():
         of = f" of {scanner}" if several else ""
         rows += [
-            (f"Calibration{of}", header.id),
             (f"Scanner{of}", " ".join(x for x in (scanner, header.scanner_model, header.scanner_serial) if x)),
             ("Inertial unit", header.imu_serial),
             ("Installation", header.installation),
-            ("Made", header.created.strftime("%Y-%m-%d %H:%M %Z")),
         ]
     known = [row for row in dict.fromkeys(rows) if row[1]]
     return Table("", ("", ""), known, left=(0, 1)) if known else None

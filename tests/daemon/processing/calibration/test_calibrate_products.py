@@ -32,8 +32,8 @@ def test_a_scanner_missing_from_the_first_session_uses_its_own_head() -> None:
     found = SimpleNamespace(parameters=np.zeros(3))
     adjusted = SimpleNamespace(calibrations={"left": found, "right": found}, variance_factor=1.0, redundancy=9)
     kept = SimpleNamespace(logged=[session("D-ABCD", left="L1"), session("D-ABCD", left="L1", right="R1")])
-    features = SimpleNamespace(planes=[], ties=[])
-    done = cast(Calibrated, SimpleNamespace(adjusted=adjusted, kept=kept, features=features))
+    features, flight = SimpleNamespace(planes=[], ties=[]), SimpleNamespace(swaths=[])
+    done = cast(Calibrated, SimpleNamespace(adjusted=adjusted, kept=kept, features=features, flight=flight))
     assert [_header(done, name, []).scanner_serial for name in ("left", "right")] == ["L1", "R1"]
 
 

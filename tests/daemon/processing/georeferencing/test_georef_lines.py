@@ -44,4 +44,4 @@ def test_a_trajectory_has_source_sigmas_fixed_share_and_doubts(changed: dict[str
 
 def test_last_returns_are_told_where_they_differ() -> None:
     assert density_words({"all": 12.34, "last": 12.31}) == "12.3 per m²"
-    assert density_words({"all": 12.3, "last": 9.8}) == "12.3 per m² (9.8 last returns)"
+    assert density_words({"all": 12.3, "last": 9.8}) == "12.3 per m² (9.80 last returns)"

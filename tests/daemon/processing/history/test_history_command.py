@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import datetime as dt
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from swath.calib.record.record import IDENTITY, RecordInput, record_json, record
 from swath.calib.validation.history import date_words
 from swath.daemon.cli.main import run_app
 from swath.daemon.errors import ExitCode
+from swath.daemon.processing.history.page import _apart, history_page
 from swath.daemon.processing.history.run import collect
 from swath.georef.scanner.calibration import INDEX, nominal
 from tests.calib.made_outcome import made_outcome
@@ -89,6 +91,23 @@ def test_page_pdf_and_csv_are_written(archive: Path, tmp_path: Path) -> None:
     assert float(rows[2]["omega_deg"]) == pytest.approx(0.28)
     assert (rows[2]["omega_deg_sigma"], rows[2]["phi_deg_sigma"]) == ("0.002", "")
     assert (output / "history.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_a_table_of_many_parameters_fits_a_sheet_and_dates_do_not_cover_each_other(archive: Path) -> None:
+    """Calibrations of one flight have one date: their marks stand beside each other."""
+    collected = collect([archive])
+    (scanner,) = collected.scanners
+    wide = replace(scanner.entries[0], sigmas=np.full(len(INDEX), 1e-3))
+    one = replace(scanner, entries=(wide, *scanner.entries[1:]))
+    page = history_page(replace(collected, scanners=(one,)))
+    heads = re.findall(r"<thead><tr>(.*?)</tr></thead>", page, re.S)
+    assert max(head.count("<th") for head in heads) <= 6
+    assert '4</b><span class="muted">calibrations' in page
+    assert '2</b><span class="muted">significant changes' in page
+    moved = _apart(np.array([20_000.0, 20_000.0, 20_100.0]))
+    assert moved[0] == 20_000.0
+    assert 1.0 < moved[1] - moved[0] < 3.0
+    assert moved[2] == 20_100.0
 
 
 def test_json_has_values_steps_and_courses(archive: Path, capsys: pytest.CaptureFixture[str]) -> None:

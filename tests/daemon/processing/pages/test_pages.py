@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from pypdf import PdfReader
 
 from swath import __version__
 from swath.daemon.processing.pages import pdf
-from swath.daemon.processing.pages.blocks import Cell, Image, Judged, Table, Words
+from swath.daemon.processing.pages.blocks import Cell, Image, Judged, Table, Words, reasons_of
 from swath.daemon.processing.pages.head import (
     PageHead,
     calibration_words,
@@ -20,8 +21,10 @@ from swath.daemon.processing.pages.head import (
     head_of_sidecars,
 )
 from swath.daemon.processing.pages.names import OF_COMMAND, PRINTED
-from swath.daemon.processing.pages.pdf import PdfUnavailableError, page_files, pdf_of
+from swath.daemon.processing.pages.pdf import BEFORE_UNIT, PdfUnavailableError, page_files, pdf_of
 from swath.daemon.processing.pages.render import Page, html_of
+from swath.daemon.processing.quicklook.product_facts import rows_of
+from swath.georef.verdicts import Level, Reason, Verdict
 from tests.daemon.processing.pages.builders import faults_of
 
 NINE_NS = 1_465_549_218_000_000_000  # 2026-06-15 09:00:00 UTC and 18 leap seconds
@@ -40,6 +43,34 @@ def flight_entry(**more: object) -> dict[str, object]:
         "calibrations": {"left": calibration},
         **more,
     }
+
+
+def test_reasons_that_the_verdict_tells_are_not_repeated() -> None:
+    told, other = Reason(Level.CARE, "a", "the arm is wrong", ""), Reason(Level.CARE, "b", "few fixes", "")
+    sentence = "Usable with care: the arm is wrong."
+    assert reasons_of(Verdict(Level.CARE, sentence, (told,))) == []
+    (table,) = reasons_of(Verdict(Level.CARE, sentence, (told, other, replace(told, change="measure it"))))
+    assert isinstance(table, Table)
+    assert table.rows == [["few fixes", ""], ["the arm is wrong", "measure it"]]
+
+
+def test_times_of_a_short_flight_have_seconds() -> None:
+    assert flown_words([(NINE_NS, NINE_NS + 55_000_000_000)]) == "2026-06-15, 09:00:00 to 09:00:55 UTC"
+
+
+def test_on_paper_a_unit_stays_with_its_number() -> None:
+    assert BEFORE_UNIT.sub("_", "12 knots, 5 s apart; 4.5 cm (15.3 σ), 3 strips, 20 % of 2 m²") == (
+        "12 knots, 5_s apart; 4.5_cm (15.3_σ), 3 strips, 20_% of 2_m²"
+    )
+
+
+def test_a_unit_at_the_end_of_a_key_stands_behind_its_number() -> None:
+    rows = rows_of(
+        {"atmosphere": {"temperature_c": 15.0, "pressure_hpa": 1013.0, "model": "standard", "height_m": 0.0}}
+    )
+    assert rows == [("atmosphere", "temperature 15 °C, pressure 1013 hPa, model standard, height 0 m")]
+    crs = rows_of({"crs": {"crs": "EPSG:32632", "accuracy_m": 0.5}})
+    assert crs == [("CRS", "EPSG:32632"), ("CRS: accuracy", "0.5 m")]
 
 
 def test_the_head_gives_flight_logs_aircraft_crs_calibration_and_software() -> None:

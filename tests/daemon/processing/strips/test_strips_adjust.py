@@ -167,7 +167,8 @@ def test_an_unusable_trajectory_is_reported_first_and_stays_unusable(
     told = capsys.readouterr()
     line = f"not to be used: trajectory {file}: the lever arm has another sign"
     assert told.out.splitlines()[0] == line
-    assert f"{line}; use --accept-verdict to accept it" in told.err
+    assert told.err.endswith('swath: the verdict is "not to be used"; use --accept-verdict to accept it\n')
+    assert line not in told.err
     (said,), source = file_verdicts(trajectory_of(output, ".sbet"), made.trajectory.span)
     assert (said.level, source) == (Level.UNUSABLE, "navigated")
     assert run_app(arguments(made, file, output, "--strip-model", "constant", "--overwrite", "--accept-verdict")) == 0

@@ -97,7 +97,7 @@ def test_the_page_is_complete(flight: Flight) -> None:
     words = "".join(page.words)
     assert verdict.sentence in words
     assert all(reason.what in words and reason.change in words for reason in verdict.reasons)
-    for told in ("GPS week 2376", "static alignment over 140 s", "rtk float", "1\u202f787", "gyro bias x"):
+    for told in ("GPS week 2376", "static alignment over 140 s", "RTK float", "1\u202f787", "gyro bias x"):
         assert told in words, told
     titles = [title for title, *_ in PICTURES]
     assert all(title in words for title in titles)
