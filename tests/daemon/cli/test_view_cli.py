@@ -134,7 +134,7 @@ def test_tables_match_the_input(page: Page) -> None:
     assert rows["s1.laz"][1:] == ["24\u202f000", "1.4, 6", "ETRS89 / UTM zone 32N", "left: cal-2026", "whole"]
     assert rows["RMSDz"][1:4] == ["7.0 cm", "≤ 4 cm not met", "≤ 8 cm met"]
     assert rows["pulses per m²"][2] == "≥ 8 not met"
-    assert rows["pulses per m²"][4] == "≥ 2 kept"
+    assert rows["pulses per m²"][4] == "≥ 2 met"
     assert "strips meet the 10 cm class" in page.words
     assert "ETRS89 / UTM zone 32N (EPSG:25832)" in page.words
 
