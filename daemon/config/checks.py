@@ -284,7 +284,7 @@ def _wires(config: Config) -> Iterator[tuple[str, TransportSpec]]:
             if text is None:
                 continue
             try:
-                spec = parse_transport(text)
+                spec = config.transport(text)
             except ValueError:
                 continue  # already a finding
             if spec.carrier is None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,6 +28,7 @@ from swath.drivers.transports.spec import TransportSpec, parse_transport
 
 DeviceTable = GnssConfig | ImuConfig | ScannerConfig | CorrectionsConfig | RawConfig
 FileKey = Literal["dbc", "calibration", "geometry"]
+_PATH_SOURCES = ("fixed", "serial-dcd")  # kinds of PPS source whose path may be relative
 PARSER_FILES: tuple[FileKey, ...] = ("dbc", "geometry")  # files that a parser needs; it does not use the calibration
 
 
@@ -76,8 +77,15 @@ class Config:
 
     @property
     def pps(self) -> dict[str, PpsConfig]:
-        """Tables ``[pps.<name>]``, by name."""
-        return self.tables.pps
+        """Tables ``[pps.<name>]``, by name, with absolute paths of ports and FIFOs."""
+        return {
+            name: pps.model_copy(update={"source": self._absolute_source(pps.source)})
+            for name, pps in self.tables.pps.items()
+        }
+
+    def _absolute_source(self, source: str) -> str:
+        kind, _, path = source.partition(":")
+        return f"{kind}:{self.resolve(path)}" if path and path.isprintable() and kind in _PATH_SOURCES else source
 
     @property
     def gnss(self) -> dict[str, GnssConfig]:
@@ -137,6 +145,19 @@ class Config:
     def resolve(self, name: str) -> Path:
         """Return an absolute path for a name in the file; relative names are relative to the file's folder."""
         return (self.path.parent / name).absolute()
+
+    def transport(self, text: str) -> TransportSpec:
+        """Parse a transport of the file; a relative path of a port is relative to the file's folder.
+
+        Raises:
+            ValueError: the text is invalid; the message names the error and a valid form.
+        """
+        spec = parse_transport(text)
+        if spec.kind == "serial":
+            return replace(spec, address=str(self.resolve(spec.address)))
+        if spec.kind == "can" and "/" in spec.channel:  # a serial adapter
+            return replace(spec, address=f"{spec.interface}:{self.resolve(spec.channel)}")
+        return spec
 
     def device_tables(self) -> Iterator[tuple[DeviceKind, str, DeviceTable]]:
         """Yield (kind, name, table) of every device, in the order of the kinds and of the file."""
@@ -210,8 +231,8 @@ class Config:
             yield DeviceEntry(
                 kind=kind,
                 name=name,
-                transport=parse_transport(table.transport),
-                auxiliary=parse_transport(auxiliary) if auxiliary else None,
+                transport=self.transport(table.transport),
+                auxiliary=self.transport(auxiliary) if auxiliary else None,
                 protocol=table.protocol,
                 pps=None if isinstance(table, CorrectionsConfig | RawConfig) else table.pps,
                 settings=self.settings_of(kind, name, table),

@@ -394,7 +394,7 @@ def parse_pps(text: str, edge: str = "assert") -> PpsSpec:
     kind, colon, path = text.partition(":")
     if text.startswith("/"):
         return PpsSpec("device", text, edge)
-    if kind == "serial-dcd" and path.startswith("/"):
+    if kind == "serial-dcd" and colon and path:
         return PpsSpec(kind, path, edge)
     if kind == "fixed" and colon and path:
         return PpsSpec(kind, path, edge)

@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import array
 import fcntl
+import os
 import socket
 import termios
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
 
-from swath.daemon.config import parse_config
+from swath.daemon.config import load_config, parse_config
 from swath.daemon.devices.check import check_everything
 from swath.daemon.devices.identify import Heard
 from swath.daemon.devices.setup import Outcome, apply_setup, plan_setup
+from swath.daemon.errors import ConfigError
 from swath.daemon.log.parsers import stored_parsers
 from swath.daemon.log.reader import open_logs
+from swath.daemon.replay.units import close_outputs, open_outputs
 from swath.daemon.replay.wire_player import TcpOutput
 from swath.drivers.driver import KINDS, STREAM_TRANSPORTS, Driver, all_drivers
 from swath.drivers.transports.base import TransportError
@@ -243,3 +247,34 @@ def test_two_heads_on_one_port_are_two_sources_and_strangers_are_named(tmp_path:
     (note,) = [note for report in found for note in report.notes if "senders other than" in note]
     assert "127.0.0.4 (" in note
     assert all(report.units > 5 for report in found[:2])
+
+
+def test_relative_ports_and_fifos_are_beside_the_configuration(tmp_path: Path) -> None:
+    """The recorder, the check and the replay run in another folder than that of the configuration."""
+    folder = tmp_path / "rig"
+    folder.mkdir()
+    line = Pty(folder / "port")
+    os.mkfifo(folder / "pulse")
+    text = '[session]\nname = "x"\ndirectory = "logs"\nreserve_mb = 1\n[pps.main]\nsource = "fixed:pulse"\n'
+    text += '[gnss.rover]\ntransport = "serial:port"\nprotocol = "nmea"\npps = "main"\n'
+    with Recorder(folder, text) as recorder, (folder / "pulse").open("w") as edges:
+        recorder.wait_said("device_opened", times=2)
+        line.write(nmea_zda(36_000))
+        edges.write(f"{time.time_ns()} 1\n")
+        edges.flush()
+        wait_until(lambda: not _unread(line.slave), "the line is read", 60.0)
+        assert recorder.stop() == 0, recorder.stderr()
+    content = read_log(folder / "logs")
+    assert content.data("gnss/rover") == nmea_zda(36_000)
+    assert len(content.messages["/pps/main"]) == 1
+    config = load_config(folder / "swath.toml")
+    reports = {report.source: report for report in check_everything(config, 0.3)}
+    assert reports["gnss/rover"].opens
+    assert reports["pps/main"].opens
+    line.unplug()
+    outputs = open_outputs(config, with_pps=True)
+    assert (folder / "port").is_symlink()
+    close_outputs(outputs)
+    twice = text + f'[gnss.other]\ntransport = "serial:{folder}/port"\nprotocol = "nmea"\n'
+    with pytest.raises(ConfigError, match=f"both use the device {folder}/port"):
+        parse_config(twice, folder / "swath.toml")
