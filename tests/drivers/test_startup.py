@@ -100,6 +100,12 @@ class TestUbx:
         assert shown["CFG-TP-LEN_TP1"] == 0
         assert shown["CFG-TP-TIMEGRID_TP1"] == shown["CFG-TP-POL_TP1"] == shown["CFG-TP-ALIGN_TO_TOW_TP1"] == 1
 
+    def test_the_moving_baseline_is_requested_with_a_second_antenna(self) -> None:
+        assert "RELPOSNED" not in " ".join(texts(ubx_startup.startup_messages(settings(), StartupOptions())))
+        both = DeviceSettings("gnss/rover", {"secondary_lever_arm_m": [0.0, 1.0, 0.0]})
+        lines = texts(ubx_startup.startup_messages(both, StartupOptions()))
+        assert "CFG-MSGOUT-UBX_NAV_RELPOSNED_UART1 = 1" in lines
+
     def test_raw_measurements_are_not_requested_with_raw_off(self) -> None:
         assert "RXM" not in " ".join(texts(ubx_startup.startup_messages(settings(raw=False), StartupOptions())))
 

@@ -35,12 +35,14 @@ MESSAGE_RATES = {  # CFG-MSGOUT-UBX_…, the key of I2C; its value is a number o
     "NAV_TIMEGPS": 0x20910047,
     "NAV_TIMELS": 0x20910060,
     "NAV_EOE": 0x2091015F,
+    "NAV_RELPOSNED": 0x2091008D,
     "TIM_TP": 0x2091017D,
     "TIM_TM2": 0x20910178,
     "RXM_RAWX": 0x209102A4,
     "RXM_SFRBX": 0x20910231,
 }
 EACH_EPOCH = ("NAV_PVT", "NAV_HPPOSLLH", "NAV_COV", "NAV_TIMEGPS", "NAV_EOE", "TIM_TP", "TIM_TM2")
+HEADING_EACH_EPOCH = ("NAV_RELPOSNED",)  # where a second antenna is configured
 EACH_SECOND = ("NAV_TIMELS",)
 RAW_EACH_EPOCH, RAW_EACH_SECOND = ("RXM_SFRBX",), ("RXM_RAWX",)
 
@@ -121,7 +123,8 @@ def startup_messages(settings: DeviceSettings, options: StartupOptions) -> tuple
         ),
         tuple(Item(*item) for item in TIME_PULSE),
     ]
-    each_epoch = EACH_EPOCH + (RAW_EACH_EPOCH if setup.raw else ())
+    two_antennas = settings.config.get("secondary_lever_arm_m") is not None
+    each_epoch = EACH_EPOCH + (HEADING_EACH_EPOCH if two_antennas else ()) + (RAW_EACH_EPOCH if setup.raw else ())
     each_second = EACH_SECOND + (RAW_EACH_SECOND if setup.raw else ())
     groups += [(_message_rate(name, port, 1),) for name in each_epoch]
     groups += [(_message_rate(name, port, setup.rate_hz),) for name in each_second]
