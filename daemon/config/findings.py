@@ -96,7 +96,8 @@ def _why_unseen(table: ImuConfig | ScannerConfig, yields: tuple[type, ...]) -> s
     if isinstance(table, ScannerConfig):
         silent = TimeMessage in yields and table.auxiliary is None
         return "its position packets tell it, and no port receives them; set auxiliary" if silent else ""
-    if DeviceClockSamples not in yields and TimeMessage not in yields:
+    latches = DeviceClockSamples in yields or TimeMessage in yields
+    if not latches or table.protocol == "oxts-ncom":
         return f"{table.protocol} does not send what it latches at a pulse; remove pps"
     if table.protocol == "dbc" and (table.signals is None or table.signals.pps_ticks is None):
         return "its signals have no pps_ticks, the counter latched at a pulse; add it or remove pps"

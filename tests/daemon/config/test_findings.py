@@ -54,6 +54,8 @@ def test_a_pps_that_nothing_can_show_is_named() -> None:
         "remove pps"
     ]
     assert "pps_event is missing" in findings(PPS + CAN_IMU.replace("xsens-mti", "sbg-ellipse"))[0]
+    ncom = '[imu.m]\ntransport = "udp:0.0.0.0:3000"\nprotocol = "oxts-ncom"\npps = "p"\n'
+    assert "oxts-ncom does not send what it latches at a pulse" in findings(PPS + ncom)[0]
     head = (
         '[scanner.l]\ntransport = "udp:0.0.0.0:2368"\nprotocol = "velodyne-vlp16"\ninstallation_deg = [0, 0, 0]\n'
         'pps = "p"\n'

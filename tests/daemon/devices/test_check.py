@@ -319,10 +319,12 @@ class TestOtherProtocols:
                 gzip.decompress((ROOT / "fixtures/microstrain/mip_data.bin.gz").read_bytes())[:65536],
                 "microstrain",
             ),
+            (1024, gzip.decompress((ROOT / "fixtures/sbg-ecom/made.bin.gz").read_bytes()), "sbg-ecom"),
+            (1024, gzip.decompress((ROOT / "fixtures/oxts-ncom/made.bin.gz").read_bytes()), "oxts-ncom"),
             (16, b"".join(encode_can_frame(number, bytes(8)) for number in (0x120, 0x121, 0x122)) * 20, "sbg-ellipse"),
             (16, b"".join(encode_can_frame(number, bytes(8)) for number in (0x005, 0x032, 0x034)) * 20, "xsens-mti"),
         ],
-        ids=["xsens-xbus", "vectornav", "microstrain", "sbg-ellipse", "xsens-mti"],
+        ids=["xsens-xbus", "vectornav", "microstrain", "sbg-ecom", "oxts-ncom", "sbg-ellipse", "xsens-mti"],
     )
     def test_an_imu_of_another_protocol_is_named(self, unit: int, frames: bytes, protocol: str) -> None:
         whole = len(frames) // unit
