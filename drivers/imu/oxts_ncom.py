@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from math import isfinite, nan
 from typing import TypeAlias
 
-from swath.drivers.driver import STREAM_TRANSPORTS, Driver
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside
 from swath.drivers.framing.framer import Frame, FrameKind, Framer
 from swath.drivers.gnss.record_rows import Row, join_rows
 from swath.drivers.imu.unit_time import WEEK_NS, Moment, UnitTime
@@ -347,15 +347,14 @@ def make_time_parser(settings: DeviceSettings) -> NcomParser:
     return NcomParser(settings, wanted=(TimeMessage,))
 
 
-DRIVERS = (
-    Driver(
-        protocol="oxts-ncom",
-        kind="imu",
-        transports=STREAM_TRANSPORTS,
-        yields=(ImuSamples, InsSolution, TimeMessage, EventMark, DeviceStatus),
-        summary="OxTS by NCOM: INS with sigmas, accelerations and rates, triggers",
-        make_parser=NcomParser,
-        make_time_parser=make_time_parser,
-        names_edge=NamesEdge.PREVIOUS,
-    ),
+UNIT = Driver(
+    protocol="oxts-ncom",
+    kind="imu",
+    transports=STREAM_TRANSPORTS,
+    yields=(ImuSamples, InsSolution, TimeMessage, EventMark, DeviceStatus),
+    summary="OxTS by NCOM: INS with sigmas, accelerations and rates, triggers",
+    make_parser=NcomParser,
+    make_time_parser=make_time_parser,
+    names_edge=NamesEdge.PREVIOUS,
 )
+DRIVERS = (UNIT, receiver_inside(UNIT))
