@@ -287,8 +287,8 @@ SIDEWAYS = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]  # spin axis forw
 def vlp16_quanta(pulse: Int64Array, groups: int) -> FloatArray:
     """Return the number of azimuth quanta to which a firing's azimuth is known.
 
-    Between two groups of a packet it is interpolated: one. Behind the last group it goes on from the last two, a_n and
-    a_n + t (a_n − a_n−1) for the share t of the time from group to group: 1 + 2t.
+    Between two groups of a packet the azimuth is interpolated, which costs one quantum. After the last group it is
+    extrapolated as a_n + t (a_n − a_n−1), t being the share of the time between groups, which costs 1 + 2t.
     """
     place = pulse % 32
     share = ((place // 16) * 55.296 + (place % 16) * 2.304) / 110.592  # VLP-16 manual, 9.4

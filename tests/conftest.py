@@ -43,8 +43,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Give one worker to tests that share something made once: a fixture of their file, or loops to be compiled.
 
-    `make test` compiles most loops beforehand, those of calib all. The rest is compiled once for georef and once for
-    sim; tests of whole commands find it there, or compile the same beside them.
+    `make test` compiles most loops beforehand, and all of calib. The rest is compiled once for georef and once for
+    sim; tests of whole commands find these in the cache, or compile them at the same time.
     """
     for item in items:
         marker = item.get_closest_marker("xdist_group")

@@ -52,6 +52,7 @@ SETTLE_S = 2.0
 @dataclass(frozen=True)
 class Flight:
     """A virtual flight, and what is done with it.
+
     Attributes:
         preset, more: the plan: a preset of the program and, if not empty, further tables below it.
         seconds: length; None: to its end.

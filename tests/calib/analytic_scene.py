@@ -87,6 +87,7 @@ def fly(
     highest_m: float = 11.0,
 ) -> Flight:
     """Return a flight with nominal calibration over ground z = f(x, y) in t; ``true`` is what the scanner really is.
+
     Args:
         errors: (lines, 6) of the trajectory given: east, north, up m; small turns about north, east, down of b, rad.
         sigmas: the given trajectory's, m and rad.

@@ -51,6 +51,7 @@ SPEED_MPS, HALF_ANGLE_RAD, SCAN_HZ, POSE_S = 50.0, np.radians(30.0), 50.0, 0.01
 @dataclass(frozen=True, eq=False)
 class Cast:
     """Flight over a scene with its truth.
+
     Attributes:
         flight: the flight, placed with the nominal calibration.
         truth: the true calibration.
@@ -93,14 +94,14 @@ def cast_flight(
     """Fly lines with gusts over a terrain (keys of the plan's ``[terrain]``).
 
     Args:
-        terrain: keys and tables of it.
-        lines: to be flown.
+        terrain: keys and tables of ``[terrain]``.
+        lines: the lines to be flown.
         prf_hz: pulse rate.
-        true: what the scanner really is, names of `swath.georef.scanner.calibration.PARAMETERS`; None: `TRUE`.
-        seed: of noise and gusts.
+        true: true parameters by names of `swath.georef.scanner.calibration.PARAMETERS`; None: `TRUE`.
+        seed: determines noise and gusts.
         range_sigma_m, angle_sigma_rad: noise of a return.
-        half_angle_rad: of the scan.
-        speed_mps: over the ground.
+        half_angle_rad: half of the scan's width.
+        speed_mps: speed over the ground.
     """
     draws = np.random.default_rng(seed)
     plan = parse_plan(_plan(terrain, lines), Path())

@@ -69,6 +69,7 @@ def roofs(slope_deg: float = 35.0) -> list[tuple[FloatArray, FloatArray]]:
 @dataclass(frozen=True, eq=False)
 class Made:
     """Flight with its features.
+
     Attributes:
         flight: points placed with the head's start calibration.
         features: planes, with every return's index.
@@ -193,13 +194,13 @@ def made(
     """Fly the lines over the planes.
 
     Args:
-        truth: parameters of the scanner, SI; None: a boresight and a range offset.
-        lines, planes: where, over what; None: `roofs`.
-        points: aimed at each plane from each line.
-        seed: of aims and noise.
-        noise: times `NOISE`.
-        true: where the aircraft really was; None: where it says.
-        ibrc: table of the scanner.
+        truth: true parameters of the scanner, SI; None: a boresight and a range offset.
+        lines, planes: lines flown, and planes below them; None: `roofs`.
+        points: number of beams aimed at each plane from each line.
+        seed: determines aims and noise.
+        noise: factor of `NOISE`.
+        true: the aircraft's true trajectory; None: the one that it states.
+        ibrc: table of the scanner's range corrections by intensity.
     """
     planes = roofs() if planes is None else planes
     flown = trajectory(lines)

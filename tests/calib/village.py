@@ -92,6 +92,7 @@ TRUE = {"omega_deg": 0.25, "phi_deg": -0.4, "kappa_deg": 0.6, "range_offset_m": 
 @dataclass(frozen=True, eq=False)
 class Made:
     """Flight with its truth.
+
     Attributes:
         flight: as read, with nominal calibration, on the true trajectory with the INS's sigmas.
         truth: the true calibration.
@@ -125,12 +126,12 @@ def village(
     """Fly some of `LINES` and read the log on the true trajectory.
 
     Args:
-        folder: for the log and what is kept of it.
-        seed, prf_hz: of the flight.
+        folder: holds the log and what is derived from it.
+        seed, prf_hz: seed of the flight, and pulse rate.
         lines: indexes of `LINES`.
-        true: what the scanner really is, keys of a calibration file; None: `TRUE`.
+        true: the true calibration, by keys of its file; None: `TRUE`.
         plan_more: tables added to the plan.
-        sigma_m, sigma_deg: that the true trajectory says of itself, each coordinate, each angle (heading twice).
+        sigma_m, sigma_deg: sigmas stated by the true trajectory for each coordinate and angle (heading: twice).
     """
     tables = "\n".join(f"{key} = {value}" for key, value in (TRUE if true is None else true).items())
     text = HEADER.format(seed=seed, prf_hz=prf_hz, true=tables)

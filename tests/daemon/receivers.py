@@ -18,6 +18,7 @@ Reply = Callable[[bytes], bytes]
 
 class Receiver:
     """A serial device that accepts commands at its own rate, answers them, and sends data all the time.
+
     Args:
         split: cuts one whole command off the front of what came; (command, rest), or None.
         reply: returns the answer to a command.

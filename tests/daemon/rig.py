@@ -154,10 +154,9 @@ class Recorder:
 
     @contextlib.contextmanager
     def stopped_thread(self, name: str) -> Iterator[None]:
-        """Stop one thread, as before a disk that does not answer, while the others go on.
+        """Stop one thread, as a disk that does not answer would, while the others continue.
 
-        Where it was stopped it may hold the interpreter's lock, which would stop everything: then it is released and
-        stopped again elsewhere.
+        A thread that holds the interpreter's lock would stop everything, so it goes on and is stopped again elsewhere.
         """
         libc = ctypes.CDLL(None, use_errno=True)
         attach, detach, wait_all = 16, 17, 0x40000000

@@ -86,12 +86,12 @@ def two_lines(
     """Return the plan of two opposite lines at 50 m/s, with a receiver, an IMU and a scanner.
 
     Args:
-        name: of the flight.
-        flight, gnss, imu: lines of these tables.
+        name: the flight's name.
+        flight, gnss, imu: text added to these tables.
         half_m: half of a line's length.
-        norths_m: of the lines, the first flown to the east.
-        height_m: of both, ellipsoidal.
-        prf_hz: of the scanner.
+        norths_m: north coordinate of each line; the first is flown to the east.
+        height_m: ellipsoidal height of both lines.
+        prf_hz: the scanner's pulse rate.
     """
     lines = [
         f'[[line]]\nname = "{number}"\nfrom_m = [{-east}, {north}]\nto_m = [{east}, {north}]\nheight_m = {height_m}\n'

@@ -54,6 +54,7 @@ class Clock:
 
 class Standin:
     """A flight of so many seconds.
+
     Args:
         pulled: (source, from, to) when nothing comes and the wire is unplugged.
         silent: the same, but the wire stays plugged in.

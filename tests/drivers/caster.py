@@ -14,6 +14,7 @@ Script = Callable[[socket.socket, int], None]
 @dataclass
 class Caster:
     """An NTRIP server on the loopback.
+
     Attributes:
         port: where it listens.
         requests: heads of the requests, in order.

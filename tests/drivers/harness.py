@@ -209,8 +209,8 @@ class _Shared(pickle.Unpickler):
 def check_cuts(make: Factory, data: bytes, positions: Iterable[int], ends: Sequence[int] = ()) -> None:
     """Check that cutting in two at each position gives the same records and counters.
 
-    A parser that has taken everything up to a checkpoint is copied, so that a cut costs the bytes around it only;
-    ``ends`` are those of messages, in order, behind which less will do.
+    Parsers are copied at checkpoints, so that a cut costs only the bytes around it. ``ends`` has the ends of messages
+    in order; after a cut, a few of them are enough.
     """
     base, taken = make(), 0
     for start, group in itertools.groupby(sorted(positions), lambda position: position - position % CHECKPOINT_BYTES):
@@ -259,7 +259,7 @@ def check_stream(make: Factory, data: bytes) -> Outcome:
 
 
 def find_messages(make: Factory, data: bytes) -> list[Message]:
-    """Return where the messages are: fed byte by byte, a message ends where the parser counts it.
+    """Return the places of messages: fed byte by byte, a message ends where the parser counts it.
 
     Messages that appeared together (released behind a false sync) are left out, because their places are unknown.
     """

@@ -22,6 +22,7 @@ def recording(name: str) -> bytes:
 @dataclass(frozen=True)
 class AsciiLog:
     """One ASCII log.
+
     Attributes:
         name: without the format letter: ``BESTPOS``.
         status: GPS reference time status; empty in a short header.

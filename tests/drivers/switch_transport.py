@@ -11,6 +11,7 @@ from swath.drivers.transports.base import Transport, TransportError, UnitBlock
 
 class SwitchTransport(Transport):
     """A transport that gives one unit per call: its number in four bytes.
+
     Attributes:
         refuse_open: True if opening fails.
         drop_every: each n-th unit is dropped by the kernel, and counted; 0: none.

@@ -42,6 +42,7 @@ class FindingError(AssertionError):
 @dataclass(frozen=True, slots=True)
 class Target:
     """A reader of foreign bytes.
+
     Attributes:
         name: name on the command line, and of the folder of its inputs.
         seeds: inputs to begin with.
@@ -72,7 +73,7 @@ def check(target: Target, data: bytes, *, memory: bool = False) -> set[str]:
     """Run one input under all rules.
 
     Raises:
-        Exception: whatever the target raised, a warning too; `FindingError` for time and memory.
+        Exception: whatever the target raised, including warnings; `FindingError` for time and memory.
     """
     started = time.process_time()
     with warnings.catch_warnings():
@@ -107,13 +108,13 @@ def inputs_of(target: Target, seed: bytes, key: bytes, length: int) -> Iterator[
 
 
 def fuzz(target: Target, paths: int, *, number: int | None = None, report: Report | None = None) -> Report:
-    """Check the inputs of so many paths; a finding ends the search once its path is minimal.
+    """Check the inputs of a number of paths; a finding ends the search once its path is minimal.
 
     Args:
         target: reads the inputs.
-        paths: examples that Hypothesis makes.
+        paths: number of paths that Hypothesis makes.
         number: seed of Hypothesis; None: the same paths each time.
-        report: is continued.
+        report: figures to which this run adds.
     """
     found = report or Report()
 

@@ -56,15 +56,14 @@ def changed_text(rng: random.Random, base: bytes, words: tuple[str, ...]) -> byt
 
 def told(read: Callable[[], Iterable[str]], *refusals: type[Exception], begins: str = "") -> set[str]:
     """Return what was seen, or the beginning of a refusal.
+
     Args:
-        read: does what the command does.
-        refusals: errors that the command turns into a line.
+        read: reads the text as the command does.
+        refusals: errors that the command reports in a line.
         begins: how each of several lines must begin if the reader reports every mistake; empty: only one line.
 
-    |
-
     Raises:
-        FindingError: a refusal of several lines, or of none.
+        FindingError: if a refusal has several lines or none.
     """
     try:
         return set(read())
@@ -87,6 +86,7 @@ def text_target(
     mistakes_a_line: bool = False,
 ) -> Target:
     """Return the target of a reader of a text file.
+
     Args:
         name: name of the target and of the file.
         seeds, words: see `changed_text`.

@@ -68,7 +68,7 @@ class Oscillator:
 class Edges:
     """How the simulated host sees the PPS edges.
 
-    `late_s` shifts the whole train, as inverted polarity does, which marks the pulse's other end.
+    `late_s` delays all edges, as inverted polarity does, which marks the other end of the pulse.
     """
 
     noise_ns: float = 1500.0

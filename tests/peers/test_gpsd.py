@@ -49,7 +49,7 @@ leap_seconds = 18
 class Case:
     """A recording, and the resolution of its messages in degrees and metres.
 
-    A NMEA minute has decimals, whose number decides.
+    In NMEA it follows from the number of decimals of a minute.
     """
 
     protocol: str

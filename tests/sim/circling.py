@@ -52,6 +52,7 @@ def derivative(function: object, time_s: FloatArray) -> FloatArray:
 
 class Circling:
     """Circles to the right around the site at 60 m/s.
+
     Args:
         level: True if roll and pitch are zero.
         end_s: the flight's end.

@@ -48,6 +48,7 @@ def second_told(utc_s: int) -> bytes:
 
 class Receiver:
     """A serial port that reports each second shortly after it has begun.
+
     Args:
         clock_ns: the receiver's own time, UTC.
     """

@@ -14,6 +14,7 @@ TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 @dataclass(frozen=True)
 class Moment:
     """Processor time so far, in seconds.
+
     Attributes:
         monotonic_s: the moment.
         busy_s: time of all processors, with that which a hypervisor gave to other machines.

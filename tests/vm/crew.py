@@ -44,14 +44,14 @@ def _environment() -> list[str]:
 def aboard(
     shared: Path, module: str, *arguments: object, before: str = "", qemu: Sequence[str | Path] = (), seconds: float
 ) -> Finished:
-    """Run a program of this package in the machine to its good end.
+    """Run a program of this package in the machine, and check that it succeeds.
 
     Args:
-        shared: ``/vm`` of the machine.
-        module, arguments: the program.
-        before: shell that comes before it.
+        shared: folder of the host that is ``/vm`` in the machine.
+        module, arguments: name and arguments of the program.
+        before: shell commands that run before it.
         qemu: further devices.
-        seconds: what it takes on an idle machine, besides booting.
+        seconds: its duration on an idle machine, without booting.
     """
     return run(
         command(module, *arguments, before=before),
@@ -90,6 +90,7 @@ def facts(shared: Path, name: str) -> dict[str, Any]:
 
 class GnssReceiver:
     """A receiver on this computer for a serial line of the machine: NMEA on a pty, PPS as a byte that sets DCD.
+
     Attributes:
         port: the pty, for qemu.
         pulses_utc_s: seconds of the pulses so far.

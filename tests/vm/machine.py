@@ -61,6 +61,7 @@ class Finished:
 
     def check(self) -> Finished:
         """Return this if the status is 0.
+
         Raises:
             AssertionError: the status is another; the message has the last output.
         """
@@ -97,10 +98,10 @@ class Machine:
         return _text(self.shared / "console")
 
     def said(self, pattern: str, timeout_s: float = BOOT_S) -> re.Match[str]:
-        """Wait until the command has said what the pattern finds.
+        """Wait until the command has printed something that matches the pattern.
 
         Raises:
-            AssertionError: it has not in time, or the machine has ended.
+            AssertionError: if this takes too long, or the machine has ended.
         """
         until_s = time.monotonic() + timeout_s
         while True:
@@ -117,7 +118,7 @@ class Machine:
         """Run one more bash command in a machine whose own command is `SERVE`, and wait for it; any status will do.
 
         Raises:
-            AssertionError: the machine has ended, or the command has not in time.
+            AssertionError: if the machine has ended, or the command takes too long.
         """
         self._asked += 1
         asked, answered = self.shared / "ask", self.shared / "answer"
@@ -214,19 +215,20 @@ def start(
 ) -> Machine:
     """Boot and run a bash command as root.
 
-    An emulated machine may hang while its kernel begins (README, pitfalls): one in which no program has run yet is
+    An emulated machine may hang while its kernel starts (README, pitfalls); if no program has run yet, it is
     powered on again, and `stood_still` reports it.
+
     Args:
-        command: for bash, in the project's tree.
-        shared: folder of the host, ``/vm`` in the machine; holds ``output``, ``console`` and with systemd ``journal``.
-        systemd: PID 1 is systemd, and the command runs after multi-user.target.
+        command: bash command, run in the project's tree.
+        shared: the host's folder for ``/vm``; receives ``output``, ``console`` and, with systemd, ``journal``.
+        systemd: True if PID 1 is systemd, and the command runs after multi-user.target.
         overlay: files copied over the machine's root before PID 1; enabled units belong here.
-        layers: folders or images of ext4, laid under those and over the host's root, read-only, the first uppermost.
+        layers: folders or ext4 images, read-only, between ``overlay`` and the host's root, the first uppermost.
         qemu: further arguments of qemu; a network, a disk, a serial line.
-        kernel: further words of the kernel's command line.
+        kernel: text added to the kernel's command line.
         environment: further variables of qemu's environment.
         memory_mb: memory, of which three quarters may hold files.
-        timeout_s: seconds after which it is killed.
+        timeout_s: seconds after which the machine is killed.
     """
     needed = [CACHE / "kernel/boot/vmlinux", CACHE / "initramfs.gz"]
     if shutil.which("qemu-system-x86_64") is None or not all(path.exists() for path in needed):
@@ -306,6 +308,7 @@ def disk(path: Path) -> list[str]:
 
 def replay_journal(path: Path) -> None:
     """Replay the journal of an ext4 file system as the next mount would, and check it completely.
+
     Raises:
         AssertionError: it is damaged beyond that.
     """

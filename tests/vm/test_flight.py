@@ -80,6 +80,7 @@ NETWORK = (
 
 class Lines:
     """This end of the wires: the clock that is queried, CAN frames in transit, the pulses' phase.
+
     Args:
         wires: folder of the flight's ports.
         can_port: UDP port of the flight's CAN bus.

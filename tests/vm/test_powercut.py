@@ -50,6 +50,7 @@ class Synced:
 @dataclass
 class Cut:
     """What is left of a flight that ended with a power cut, its journal replayed.
+
     Attributes:
         begun_ns: the beginning of the last sync, whether it ended or not.
     """

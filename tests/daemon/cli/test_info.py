@@ -160,7 +160,7 @@ def test_long_names_and_wide_sigmas_fit_and_unknown_values_are_omitted(
 
 
 def test_a_head_s_errors_stand_once_and_repeated_datagrams_degrade_it(tmp_path: Path) -> None:
-    """Packets of a VLP-16's second port, whose length is wrong, go to the parser of its data."""
+    """Packets of a VLP-16's second port go to the parser of its data, for which their length is wrong."""
     table = (
         '[session]\nname = "n"\ndirectory = "logs"\n[scanner.roof]\ntransport = "udp:0.0.0.0:2368"\n'
         'auxiliary = "udp:0.0.0.0:8308"\nprotocol = "velodyne-vlp16"\ninstallation_deg = [0, 0, 0]\n'

@@ -55,6 +55,7 @@ def _step(x: FloatArray) -> FloatArray:
 @dataclass(frozen=True, eq=False)
 class Truth:
     """True motion of a flight of n samples.
+
     Attributes:
         edges: (n + 1,) s; angle_b, velocity_b: (n, 3) exact increments.
         flight: the simulator's trajectory.

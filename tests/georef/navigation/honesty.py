@@ -23,6 +23,7 @@ PARTS = {"position": slice(0, 3), "velocity": slice(3, 6), "attitude": slice(6, 
 @dataclass(frozen=True)
 class Honesty:
     """Consistency of one part of the state.
+
     Attributes:
         mean: NEES of three components over 3; 1 where sigmas are right.
         low, high: bounds of its 99.8 % interval.

@@ -24,6 +24,7 @@ HEADING_SHARE = 0.36  # the same for headings, as `swath trajectory` assumes
 @dataclass(frozen=True)
 class Receiver:
     """A receiver's true errors, and the sigmas that it states.
+
     Attributes:
         fixes: true errors.
         position_m, velocity_mps: sigmas assumed where the receiver states none; None where it states them.
@@ -34,9 +35,9 @@ class Receiver:
     velocity_mps: tuple[float, float, float] | None = None
 
     def told(self, rows: StructArray, optimism: float) -> StructArray:
-        """Return its observations with the stated sigmas divided by a factor.
+        """Return the receiver's observations with the stated sigmas divided by a factor.
 
-        Of positions that have no sigma by itself, the true errors are as much larger than is usually assumed.
+        For positions without a stated sigma, the true errors exceed the usual assumption by this factor.
         """
         rows = rows.copy()
         place, speed = rows["kind"] == Kind.POSITION, rows["kind"] == Kind.VELOCITY
@@ -80,8 +81,8 @@ class Compared:
 def compared(truth: Truth, receiver: Receiver, grade: str, seed: int, optimisms: Iterable[float]) -> Iterator[Compared]:
     """Fly one flight of a receiver, and navigate it for each factor by which its sigmas are too small.
 
-    Assumed is that `SHARE` of the positions' variance lasts for `TAU_S`, of headings `HEADING_SHARE`, whatever is true
-    of the receiver.
+    The filter assumes that `SHARE` of the positions' variance lasts for `TAU_S`, and `HEADING_SHARE` of the headings',
+    whatever the receiver's true errors are.
     """
     inertial, rows = noised(truth, GRADES[grade], receiver.fixes, ARM, seed)
     start = drawn_start(truth, seed)

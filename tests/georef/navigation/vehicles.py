@@ -52,6 +52,7 @@ def observed(kind: Kind, t: FloatArray, value: FloatArray, sigma: FloatArray, fi
 @dataclass(frozen=True, eq=False)
 class Recording:
     """A recording: what a filter receives, and the vehicle's true motion.
+
     Attributes:
         truth: maps times (n,) to rot_l_from_b (n, 3, 3), velocity_l (n, 3), position_e (n, 3); None if unknown.
     """
@@ -174,6 +175,7 @@ def _spec(said: dict[str, float]) -> ImuNoise:
 @dataclass(frozen=True)
 class Motion:
     """The motion of a made-up vehicle: functions of time (n,) in a plane at a place; angles in rad.
+
     Attributes:
         place: latitude, longitude rad, height m.
         north_east_down_m: maps times to (n, 3), metres from the place.

@@ -64,6 +64,7 @@ def reference_noise(name: str) -> ImuNoise:
 @dataclass(frozen=True, eq=False)
 class Aircraft:
     """A simulated flight.
+
     Attributes:
         truth: exact increments between the ends of the samples, and the motion at any time.
         on_line: (n,) True where the sample ends on a flight line.
@@ -167,6 +168,7 @@ def on_lines(flown: Aircraft, solution: Solution, step: int = 20) -> tuple[Float
 @dataclass(frozen=True, eq=False)
 class Seeds:
     """RMS on the lines over many flights, of north, east, down, roll, pitch, heading, (6,) each.
+
     Attributes:
         measured, predicted: of all flights together, m and rad.
         low, high: the 99 % interval of the measured value if the prediction is right.

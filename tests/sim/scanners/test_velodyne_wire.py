@@ -76,7 +76,7 @@ def expected_single(shot: Shots) -> list[tuple[int, int, int, float]]:
 
 
 def expected_pairs(shot: Shots) -> list[tuple[int, int, int, float]]:
-    """Return the same for dual returns: the last, and the strongest.
+    """Return the expected returns in dual mode: the last, and the strongest.
 
     If the strongest is the last, the second-strongest takes its place.
     """
