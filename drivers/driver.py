@@ -91,8 +91,8 @@ def probable_protocols(wanted: str, drivers: Mapping[str, Driver]) -> list[str]:
     """Return the protocols that a misspelt name probably means.
 
     The first of these rules that finds any counts: the same letters and digits; the same without the maker; a part
-    between the hyphens; the name or all its words in protocol and summary (``septentrio``, ``PandarXT-32``); at most
-    three similar names.
+    between the hyphens; a word of the summary (``septentrio``, ``OS1``); the name or all its words anywhere in protocol
+    and summary (``PandarXT 32``); at most three similar names.
     """
     letters = _letters(wanted)
     if not letters:
@@ -100,10 +100,12 @@ def probable_protocols(wanted: str, drivers: Mapping[str, Driver]) -> list[str]:
     words = [_letters(word) for word in re.split(r"[^0-9A-Za-z]+", wanted) if word]
     in_words = {name: _letters(f"{name} {driver.summary}") for name, driver in drivers.items()}
     parts = {name: {name, *name.split("-")} for name in drivers}
+    named = {name: set(map(_letters, re.split(r"[\s,:;]+", driver.summary))) for name, driver in drivers.items()}
     rules: tuple[Callable[[str], bool], ...] = (
         lambda name: _letters(name) == letters,
         lambda name: _letters(name.partition("-")[2]) == letters,
         lambda name: letters in map(_letters, parts[name]),
+        lambda name: letters in named[name],
         lambda name: len(letters) > 2 and letters in in_words[name],
         lambda name: len(letters) > 2 and all(word in in_words[name] for word in words),
     )

@@ -1,0 +1,1 @@
+"""RoboSense spinning heads: models with their layouts, and the parser."""
