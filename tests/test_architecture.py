@@ -34,8 +34,8 @@ SHARED_OF_GEOREF = {
     "swath.georef.timescales",
     "swath.georef.toml_tables",
 }
-# Modules outside the command line that import within functions, and what: an extra, or what is dear at start-up and
-# not needed by all who use the module.
+# Modules outside the command line that import within functions, and what they import: an extra, or a module that is
+# slow to load and not needed by all users of the importing module.
 IMPORTED_LATE = {
     "swath.daemon.log.directory": {"swath.daemon.config"},  # pydantic; commands given a folder read no configuration
     # matplotlib, Jinja2 and WeasyPrint, with --report only

@@ -135,7 +135,7 @@ def test_point_files_differ_by_at_most_a_unit_of_their_scale(flight: Path, tmp_p
         apart = np.asarray(host[name]).astype(np.int64) - np.asarray(arm64[name]).astype(np.int64)
         assert np.abs(apart).max() <= (1 if name in ("X", "Y", "Z") else 0), name
     moved = sum(np.count_nonzero(np.asarray(host[name]) != np.asarray(arm64[name])) for name in ("X", "Y", "Z"))
-    # rounded to another unit where a border between two lies within MAP_M: so many are expected at most, and scatter
+    # a value rounds differently if a border between units is within MAP_M; expected at most so many, plus their scatter
     expected = 2 * 3 * len(host.points) * MAP_M / scale_m
     assert moved <= expected + 5 * np.sqrt(expected)
 

@@ -26,9 +26,9 @@ from swath.georef.records import (
     TimeMessage,
 )
 
-# Where others count otherwise. pynmeagps joins some makers' first field to the address (PFEC,GPatt), refuses sentences
-# it does not know or whose fields it cannot type though their checksum is good (FOO, PTNTA cut into a GPGSV, RMC with
-# a wrong speed, polls without fields); UBX configuration and aiding messages are named by class and number here.
+# Other libraries count these messages differently. pynmeagps joins some makers' first field to the address (PFEC,GPatt)
+# and refuses sentences with a good checksum that it does not know or whose fields it cannot convert (FOO, PTNTA cut
+# into a GPGSV, RMC with a wrong speed, polls without fields). Swath names UBX configuration and aiding by number.
 UNCOUNTED_BY_OTHERS = {
     "furuno_nmea.log": {"PFEC": 2},
     "isync.log": {"PTNTA": 1},

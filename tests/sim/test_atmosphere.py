@@ -139,7 +139,7 @@ def test_humidity_makes_light_faster() -> None:
         )[0]
         for humidity in (0.0, 50.0)
     )
-    # 21.2 hPa of vapour of 3.089 ppm at 13.33 hPa and 20 °C in the place of air of 291.98 ppm at 0 °C
+    # 21.2 hPa of vapour (3.089 ppm at 13.33 hPa and 20 °C) replace air (291.98 ppm at 0 °C)
     wanted = 3.089 * 21.23 / 13.33 * 293.15 / 303.15 - 291.98 * 273.15 / 303.15 * 21.23 / 1013.25
     assert wet - dry == pytest.approx(wanted, abs=0.02)
 
@@ -263,7 +263,7 @@ def test_without_refraction_beams_are_straight() -> None:
 
 
 def test_visibility_is_the_distance_of_two_percent_contrast() -> None:
-    # there and back over half the visibility is once over all of it, at 550 nm
+    # at 550 nm, there and back over half the visibility equals once over all of it
     for sight_km in (3.0, 23.0, 80.0):
         air = air_of(550.0, visibility_km=sight_km)
         left = air.transmission(np.array([0.0, 500.0 * sight_km]))

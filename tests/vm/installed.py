@@ -81,7 +81,7 @@ def _install(layer: Path) -> None:
 def _make_image(layer: Path, path: Path) -> None:
     """Make an image without what a read-only disk does not need: journal, checksums, blocks reserved for root."""
     path.unlink(missing_ok=True)
-    # blocks of what is in it, one more for a part of one, one for entries; 128 MB hold the inodes of 8 GB (1/64)
+    # blocks of each file's content (rounded up) plus one for entries; 128 MB hold the inodes of 8 GB (1/64)
     held = sum(one.lstat().st_size // 4096 + 2 for one in layer.rglob("*")) * 4096
     without = ["-O", "^has_journal,^metadata_csum", "-m", "0"]
     _run(["mkfs.ext4", "-qF", *without, "-d", str(layer), str(path), f"{held // MB + 128}M"], with_sbin())

@@ -32,8 +32,8 @@ def test_a_clock_stepped_slewed_and_with_a_leap_second_gives_no_wrong_second(tmp
     assert wrong_seconds(moments, lambda moment: moment.raw_ns + told["base_ns"]) == []
     assert sum(moment.state == "LOCKED" for moment in moments) > 200
 
-    # no gap: a pulse a second, and none that is not accounted for; log_time knows nothing of steps, the least of which
-    # is a second, while an emulated timer makes a pulse some hundredths late now and then
+    # there is no gap: each second has a pulse, and all are accounted for; log_time has no steps, the least of which
+    # would be a second, but an emulated timer sometimes makes a pulse some hundredths late
     edges = [value["edge_time_ns"] - offset_ns for _, value in content.messages["/pps/main"]]
     sequences = [value["sequence"] for _, value in content.messages["/pps/main"]]
     for (edge, sequence), (later, next_sequence) in pairwise(zip(edges, sequences, strict=True)):

@@ -125,7 +125,7 @@ def test_both_services_are_enabled_and_started_at_boot(service: Machine) -> None
     assert service.told("systemctl is-enabled swathd swath-live").split() == ["enabled", "enabled"]
     assert shown(service, "ActiveState") == "active"
     assert shown(service, "User") == "swath"
-    # it comes after the other
+    # swath-live starts after swathd
     service.until("systemctl show -P ActiveState swath-live | grep -E '^(activating|active)$'")
 
 

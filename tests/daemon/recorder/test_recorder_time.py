@@ -100,7 +100,7 @@ def test_delay_and_named_edge_of_the_configuration_are_used(tmp_path: Path) -> N
         assembly = assembled(tmp_path / name, **keys)
         _, edge_ns = play(assembly)
         seconds[name] = gps_of(assembly, edge_ns) / SECOND_NS
-    # an edge stamped late lies before its stamp; messages that name the next edge give this one the second before
+    # a late stamp lies after its edge; messages that name the next edge give this edge the second before theirs
     assert abs(seconds["late"] - seconds["plain"] - 250e-6) < 2e-6
     assert abs(seconds["next"] - seconds["plain"] + 1.0) < 2e-6
 

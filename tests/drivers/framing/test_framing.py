@@ -161,8 +161,8 @@ def test_frame_counts_of_every_sbf_recording_match_other_decoders(name: str) -> 
     assert parser.counters.bytes == parser.counters.bytes_framed + parser.counters.bytes_skipped == len(data)
 
 
-# What gpsd says otherwise: it joins a sentence that another interrupted, prints one that the file's end cut, and leaves
-# out the bars that tcp-torture marks its reads with.
+# Sentences that only gpsd prints: it joins one that another interrupted, prints one that the file's end cut, and omits
+# the bars with which tcp-torture marks its reads.
 GPSD_ALONE = {
     "isync.log": [b"$GPGSV,4,1,15,02,11,115,36,05,34,060,48,07,00,023,,13,56,090,49*71"],
     "ublox-8.log": [b"$GNRMC,001053.00,A,4404.14083,N,12118.85886,W,0."],
@@ -197,8 +197,8 @@ def test_types_and_lengths_of_rtcm3_messages_match_gpsd(family: str, name: str, 
     assert len(ours) == count
 
 
-# Of every file that is broken, by the name or by pyubx2: bytes of no frame, and frames with a wrong checksum. At a cut
-# end they are what its message counts as returned and the part of the frame before that.
+# For every file that is broken by its name or by pyubx2: bytes outside frames, and frames with a wrong checksum. If the
+# file's end is cut, the bytes are those that its message counts as returned and the part of the frame before them.
 BROKEN = {
     "nmea": {
         "isync.log": (123, 0),  # a comment, and a sentence that another one interrupts

@@ -166,7 +166,7 @@ def test_vacuum_ranges_are_corrected_to_the_path_of_the_simulator(keys: dict[str
 
 
 def test_the_correction_at_one_kilometre_matches_the_formula_sheet() -> None:
-    # 15 °C, 1013.25 hPa, 10 hPa of vapour along a level path: −0.27632 m of 1000 m in real air
+    # 15 °C, 1013.25 hPa and 10 hPa of vapour along a level path change 1000 m in real air by −0.27632 m
     humidity = 100.0 * 10.0 / float(saturated_hpa(15.0))
     air = Air("vacuum", "measured", 15.0, 1013.25, humidity, 0.0)
     origin = np.array([[6_378_137.0, 0.0, 0.0]])

@@ -96,7 +96,7 @@ def test_instantaneous_samples_are_averaged_over_the_interval_between_them() -> 
         rows_of(np.broadcast_to(FORCE, (2000, 3)), rate(t)), ns(t)
     )
     assert np.array_equal(got.time_ns, ns(t))
-    # Trapezia: wrong by h³/12 times the second derivative; a sample taken for its interval's mean, by h²/2 · rate'.
+    # Trapezia err by h³/12 times the second derivative; a sample taken as its interval's mean errs by h²/2 · rate'.
     np.testing.assert_allclose(got.angle_b[1:], np.diff(rate_integral(t), axis=0), atol=1.05 * 0.5 * 9 * 0.005**3 / 12)
 
 
@@ -135,7 +135,7 @@ def test_short_gaps_are_bridged_and_marked(sample: SampleRule) -> None:
     np.testing.assert_allclose(got.interval_s, whole.interval_s, atol=1e-9)
     sound = ~np.isin(np.arange(400), np.r_[lost, lost + 1])
     np.testing.assert_allclose(got.angle_b[sound], whole.angle_b[sound], atol=1e-15)
-    # A straight line over 50 ms of cos 3t: off by 9 · 0.05² / 8 of the rate at most.
+    # A straight line over 50 ms of cos 3t errs by at most 9 · 0.05² / 8 of the rate.
     np.testing.assert_allclose(got.angle_b, whole.angle_b, atol=0.5 * 0.005 * 9 * 0.05**2 / 8 * 1.1)
 
 

@@ -222,7 +222,7 @@ def test_four_derivatives_are_continuous_at_knots(which: str, request: pytest.Fi
         )
         for side in (-1, 1)
     )
-    # within a knot the acceleration is a cubic: its own derivatives at the knot, exactly, from four values on a side
+    # between knots the acceleration is a cubic, whose derivatives at a knot follow exactly from four values on a side
     jerk = np.array([-11.0, 18.0, -9.0, 2.0]) / 6.0 / step_s
     snap = np.array([2.0, -5.0, 4.0, -1.0]) / step_s**2
     for order, weights in ((1, jerk), (2, snap)):

@@ -54,8 +54,8 @@ SECOND_ARM = [0.8, 0.9, -1.9]
 PROTOCOLS = ("novatel", "ubx", "nmea")
 LEAP_S = 18
 EARTH_M = 6.4e6
-# Half a unit of the wire: of latitude and longitude on the ground, of height, of velocity. NovAtel sends doubles, whose
-# limit is the arithmetic of this test; NMEA sends 1e-8 minutes, 0.1 mm, 1e-4 knots and 1e-4 degrees of the course.
+# Half a unit of the wire, for latitude and longitude on the ground, height and velocity. NovAtel sends doubles, whose
+# limit is the arithmetic of this test; NMEA sends 1e-8 minutes, 0.1 mm, 1e-4 knots, and 1e-4 degrees of course.
 POSITION_M = {
     "novatel": 1e-6,
     "ubx": math.radians(0.5e-9) * EARTH_M + 1e-6,
