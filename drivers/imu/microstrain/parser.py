@@ -14,7 +14,7 @@ those of its ``data_filter.hpp``, ``data_gnss.hpp``, ``data_sensor.hpp`` and ``d
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import isfinite, nan, radians
 from typing import Any, TypeAlias
 
@@ -24,7 +24,7 @@ from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside
 from swath.drivers.framing.framer import Frame, Framer
 from swath.drivers.framing.kinds import NMEA
 from swath.drivers.gnss.record_rows import Row, join_rows
-from swath.drivers.imu.microstrain.startup import startup_messages
+from swath.drivers.imu.microstrain.startup import receiver_startup_messages, startup_messages
 from swath.drivers.imu.microstrain.wire import FILTER, MIP, RECEIVERS, SENSOR, read_values
 from swath.drivers.imu.unit_time import WEEK_NS, Moment, UnitTime
 from swath.drivers.parser import DeviceSettings, StreamParser
@@ -317,4 +317,4 @@ UNIT = Driver(
     names_edge=NamesEdge.PREVIOUS,
     startup=startup_messages,
 )
-DRIVERS = (UNIT, receiver_inside(UNIT))
+DRIVERS = (UNIT, replace(receiver_inside(UNIT), startup=receiver_startup_messages))

@@ -62,8 +62,7 @@ class AckListener(AnswerListener):
 
 
 def startup_messages(settings: DeviceSettings, options: StartupOptions) -> tuple[StartupMessage, ...]:
-    """Return commands for the baud rate where it changes, the formats and streams of sensor, filter and receiver data,
-    and saving.
+    """Return commands for the baud rate where it changes, formats and streams of sensor and filter data, and saving.
 
     Raises:
         DriverSettingsError: ``rate_hz`` does not divide the unit's 1000 Hz.
@@ -76,7 +75,6 @@ def startup_messages(settings: DeviceSettings, options: StartupOptions) -> tuple
     formats = (
         (SENSOR, round(decimation), (*TIMES, *SENSOR_FIELDS[kind], "temperature", "overrange")),
         (FILTER, SOLUTION_DECIMATION, SOLUTION),
-        (RECEIVER_SET, RECEIVER_DECIMATION, FIX),
     )
     messages = [_format(descriptor_set, every, names) for descriptor_set, every, names in formats]
     messages += [_stream(descriptor_set) for descriptor_set, _, _ in formats]
@@ -84,9 +82,17 @@ def startup_messages(settings: DeviceSettings, options: StartupOptions) -> tuple
         content = struct.pack(">BBI", WRITE, PORT, options.baud)
         line = f"communication speed, port {PORT}, {options.baud}"
         messages.insert(0, _command(BASE, COMMUNICATION_SPEED, content, line, baud=options.baud))
-    if options.save:
-        messages.append(_command(THREE_DM, MESSAGE_FORMAT, bytes([SAVE, 0]), "message format, save all", last=True))
-    return tuple(messages)
+    return (*messages, *_saving(options))
+
+
+def receiver_startup_messages(settings: DeviceSettings, options: StartupOptions) -> tuple[StartupMessage, ...]:
+    """Return commands for the format and stream of the receiver inside the unit, and saving."""
+    return (_format(RECEIVER_SET, RECEIVER_DECIMATION, FIX), _stream(RECEIVER_SET), *_saving(options))
+
+
+def _saving(options: StartupOptions) -> tuple[StartupMessage, ...]:
+    save = _command(THREE_DM, MESSAGE_FORMAT, bytes([SAVE, 0]), "message format, save all", last=True)
+    return (save,) if options.save else ()
 
 
 def _format(descriptor_set: int, decimation: int, names: tuple[str, ...]) -> StartupMessage:

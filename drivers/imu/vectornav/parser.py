@@ -27,7 +27,7 @@ from swath.drivers.framing.kinds import NMEA
 from swath.drivers.gnss.record_rows import Row, join_rows
 from swath.drivers.imu.attitude import angles_of
 from swath.drivers.imu.unit_time import WEEK_NS, Moment, UnitTime
-from swath.drivers.imu.vectornav.startup import startup_messages
+from swath.drivers.imu.vectornav.startup import receiver_startup_messages, startup_messages
 from swath.drivers.imu.vectornav.wire import VECTORNAV, read_values
 from swath.drivers.parser import DeviceSettings, StreamParser
 from swath.georef.records import (
@@ -366,4 +366,4 @@ UNIT = Driver(
     names_edge=NamesEdge.PREVIOUS,
     startup=startup_messages,
 )
-DRIVERS = (UNIT, receiver_inside(UNIT))
+DRIVERS = (UNIT, replace(receiver_inside(UNIT), startup=receiver_startup_messages))

@@ -21,7 +21,6 @@ BASE_RATE_HZ = 800.0  # the rates of binary outputs divide it
 DEFAULT_RATE_HZ = 200.0
 SOLUTION_DIVISOR, FIX_DIVISOR = 16, 160  # 50 Hz, 5 Hz
 PORT = 1  # serial port 1
-OUTPUTS = (75, 76, 77)
 REFUSED = re.compile(rb"\$VN(ERR,[0-9A-Fa-f]+)\*[0-9A-Fa-f]{2}")
 
 TIMES = ("time_startup", "gps_tow", "gps_week", "time_sync_in", "time_gps_pps", "time_status")
@@ -54,17 +53,22 @@ def startup_messages(settings: DeviceSettings, options: StartupOptions) -> tuple
     commands = [
         "VNWRG,06,0",
         f"VNWRG,{SYNCHRONISATION}",
-        *(
-            output_command(register, every, fields)
-            for register, every, fields in zip(
-                OUTPUTS, (round(divisor), SOLUTION_DIVISOR, FIX_DIVISOR), (samples, SOLUTION, FIX), strict=True
-            )
-        ),
+        output_command(75, round(divisor), samples),
+        output_command(76, SOLUTION_DIVISOR, SOLUTION),
     ]
     messages = [_command(text) for text in commands]
     if options.baud is not None:
         messages.insert(0, _command(f"VNWRG,05,{options.baud}", baud=options.baud))
-    return (*messages, *((_command("VNWNV", last=True),) if options.save else ()))
+    return (*messages, *_saving(options))
+
+
+def receiver_startup_messages(settings: DeviceSettings, options: StartupOptions) -> tuple[StartupMessage, ...]:
+    """Return the command for the output of the receiver inside the unit, and saving."""
+    return (_command(output_command(77, FIX_DIVISOR, FIX)), *_saving(options))
+
+
+def _saving(options: StartupOptions) -> tuple[StartupMessage, ...]:
+    return (_command("VNWNV", last=True),) if options.save else ()
 
 
 def output_command(register: int, divisor: int, fields: Outputs) -> str:

@@ -13,7 +13,7 @@ from swath.drivers.driver import find_driver
 from swath.drivers.framing.checksums import ubx_fletcher
 from swath.drivers.imu.microstrain import wire
 from swath.drivers.imu.microstrain.parser import STANDARD_GRAVITY, MicrostrainParser, make_time_parser
-from swath.drivers.imu.microstrain.startup import startup_messages
+from swath.drivers.imu.microstrain.startup import receiver_startup_messages, startup_messages
 from swath.drivers.imu.microstrain.wire import FILTER, GNSS, SENSOR, SYSTEM, encode_data
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.drivers.startup import Answer, StartupOptions
@@ -289,6 +289,10 @@ def test_startup_asks_for_what_the_driver_reads_and_finds_the_answer() -> None:
     assert wire.MIP.intact(messages[1].data)
     increments = startup_messages(DeviceSettings("imu/main", {"sample": "increment"}), StartupOptions())
     assert increments[0].lines == ("message format, set 80, every 5: D5 D6 D3 07 08 14 18",)
+    receiver = receiver_startup_messages(DeviceSettings("gnss/rover"), StartupOptions(save=True))
+    assert receiver[0].lines == ("message format, set 91, every 1: 09 03 05 0B 11",)
+    assert receiver[-1].data == messages[-1].data
+    assert all("set 91" not in message.lines[0] for message in messages)
     data = recording()[:5000]
     for error, wanted in ((0, Answer(True)), (3, Answer(False, "invalid parameter"))):
         other = wire.encode_packet(0x0C, (0xF1, bytes([0x11, 0]))) + wire.encode_packet(0x01, (0xF1, bytes([0x0F, 0])))

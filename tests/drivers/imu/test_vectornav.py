@@ -16,7 +16,7 @@ from swath.drivers.driver import find_driver
 from swath.drivers.framing.framer import FALSE_SYNC, UNDECIDED
 from swath.drivers.imu.vectornav import wire
 from swath.drivers.imu.vectornav.parser import VectornavParser, attitude, make_time_parser
-from swath.drivers.imu.vectornav.startup import startup_messages
+from swath.drivers.imu.vectornav.startup import receiver_startup_messages, startup_messages
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.drivers.startup import Answer, StartupOptions
 from swath.georef.records import (
@@ -350,12 +350,9 @@ def test_startup_asks_for_what_the_driver_reads_and_finds_the_answer() -> None:
     messages = startup_messages(DeviceSettings("imu/main", {"rate_hz": 400.0}), StartupOptions(save=True, baud=921600))
     texts = [one.lines[0] for one in messages]
     assert texts[0] == "VNWRG,05,921600"
-    assert texts[3:] == [
-        "VNWRG,75,1,2,06,023D,081C",
-        "VNWRG,76,1,16,32,020C,0102,0613",
-        "VNWRG,77,1,160,08,16BE",
-        "VNWNV",
-    ]
+    assert texts[3:] == ["VNWRG,75,1,2,06,023D,081C", "VNWRG,76,1,16,32,020C,0102,0613", "VNWNV"]
+    receiver = receiver_startup_messages(DeviceSettings("gnss/rover"), StartupOptions(save=True))
+    assert [one.lines[0] for one in receiver] == ["VNWRG,77,1,160,08,16BE", "VNWNV"]
     assert (messages[-1].data, messages[-1].last, messages[0].baud) == (b"$VNWNV*57\r\n", True, 921600)
     increments = startup_messages(DeviceSettings("imu/main", {"sample": "increment"}), StartupOptions())
     assert increments[2].lines == ("VNWRG,75,1,4,06,023D,08D0",)
