@@ -25,6 +25,7 @@ case $PREFIX in /?*) ;; *) fail "PREFIX must be the absolute path of a folder fo
 placed() {
     cat <<LIST
 swathd.service /usr/lib/systemd/system/swathd.service
+swathd@.service /usr/lib/systemd/system/swathd@.service
 swath-live.service /usr/lib/systemd/system/swath-live.service
 swath-pps@.service /usr/lib/systemd/system/swath-pps@.service
 sysctl/90-swath.conf /usr/lib/sysctl.d/90-swath.conf
@@ -181,7 +182,7 @@ uninstall_all() {
     [ "$(id -u)" = 0 ] || [ -n "$DESTDIR" ] || fail "make uninstall needs root: sudo make uninstall"
     if on_this_computer; then
         systemctl disable --now swath-live.service swathd.service 2>/dev/null || true
-        systemctl stop 'swath-pps@*.service' 2>/dev/null || true
+        systemctl stop 'swathd@*.service' 'swath-pps@*.service' 2>/dev/null || true
     fi
     placed | while read -r _ to; do
         rm -f "$DESTDIR$to"

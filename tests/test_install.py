@@ -20,6 +20,7 @@ PLACED = {
     "usr/lib/sysctl.d/90-swath.conf",
     "usr/lib/systemd/network/80-swath-can.network",
     "usr/lib/systemd/system/swath-live.service",
+    "usr/lib/systemd/system/swathd@.service",
     "usr/lib/systemd/system/swath-pps@.service",
     "usr/lib/systemd/system/swathd.service",
     "usr/lib/sysusers.d/swath.conf",

@@ -169,6 +169,32 @@ class TestPps:
         assert 'TAG+="systemd"' in rule
 
 
+def test_the_second_recorder_is_the_first_with_places_of_its_own(tmp_path: Path) -> None:
+    """Without the comments, the units differ in nothing else."""
+
+    def lines(unit: Path) -> list[str]:
+        return [line for line in unit.read_text().splitlines() if not line.startswith("#")]
+
+    second = lines(SYSTEMD / "swathd@.service")
+    assert len(second) == len(lines(UNIT))
+    assert [line for line in second if line not in lines(UNIT)] == [
+        "Description=Swath recorder %i",
+        "RequiresMountsFor=/var/lib/swath-%i",
+        "ExecStart=/opt/swath/bin/swath run /etc/swath/%i.toml",
+        "StateDirectory=swath-%i",
+        "RuntimeDirectory=swath-%i",
+        "WorkingDirectory=/var/lib/swath-%i",
+    ]
+    program = tmp_path / "opt/swath/bin/swath"
+    program.parent.mkdir(parents=True)
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    text = (SYSTEMD / "swathd@.service").read_text().replace("/opt/swath", str(tmp_path / "opt/swath"))
+    (tmp_path / "swathd@tail.service").write_text(text)
+    done = run_tool("systemd-analyze", "verify", "--man=no", tmp_path / "swathd@tail.service")
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_no_rule_starts_a_program() -> None:
     """By udev(7), what RUN starts is killed when the event has been handled, in the background or not."""
     assert not [line for line in _udev_rules() + _udev_examples() if "RUN" in line]

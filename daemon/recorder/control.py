@@ -3,7 +3,8 @@
     {"command": "mark", "text": "line 4 start"}      {"command": "split"}
 
 The thread does a bounded amount of work in each turn and rests between turns, so that neither a flood of connections
-nor silent peers slow the recording. Only the recorder's own user and root can connect.
+nor silent peers slow the recording. Only the recorder's own user and root can connect, and members of its group if
+it runs as a service, whose group is its own.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ def socket_address(place: Path) -> Iterator[str]:
 
 
 def listen(place: Path) -> socket.socket:
-    """Return a listening socket that only its owner can connect to; a dead socket at this path is replaced.
+    """Return a listening socket for its owner and, in a unit, the unit's group; a dead socket at this path is replaced.
 
     Raises:
         OSError: another process listens there, another kind of file exists there, or the file system has no sockets.
@@ -85,6 +86,8 @@ def listen(place: Path) -> socket.socket:
         os.fchmod(sock.fileno(), 0o600)  # before bind, which creates the file with this mode
         with socket_address(place) as address:
             sock.bind(address)
+            if os.environ.get("RUNTIME_DIRECTORY"):  # outside the unit, the group may be everybody's
+                os.chmod(address, 0o660)  # not before bind, because the umask would take the group's right away
         sock.listen(PEERS)
     except OSError:
         sock.close()

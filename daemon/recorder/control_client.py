@@ -36,7 +36,9 @@ def ask(directory: Path, request: Mapping[str, str]) -> dict[str, Any]:
     except (FileNotFoundError, ConnectionRefusedError) as error:
         raise UserError(f"{directory}: no recorder is running there", ExitCode.IO) from error
     except PermissionError as error:
-        text = f"{directory}: not permitted; run this as root (sudo) or as the user of the recorder"
+        text = (
+            f"{directory}: not permitted; run this as root (sudo), as a member of group swath or as the recorder's user"
+        )
         raise UserError(text, ExitCode.IO) from error
     except OSError as error:  # includes a time-out
         raise UserError(f"{directory}: the recorder there does not answer; see its journal", ExitCode.IO) from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import re
@@ -28,6 +29,7 @@ from swath.daemon.recorder.control import (
     NOTES_PER_S,
     SPLITS_AT_ONCE,
     Control,
+    listen,
 )
 from tests.builders import ROOT
 from tests.daemon.builders import Numbers, scanner
@@ -170,6 +172,22 @@ def test_only_the_owner_of_the_recorder_can_connect(tmp_path: Path, open_folder:
         place.chmod(0o666)
         assert connect_as(NOBODY) == 0  # this shows that the mode caused the refusal
         assert recorder.stop() == 0
+
+
+def test_the_service_s_group_may_connect(open_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the unit the socket belongs to the unit's group, whose members may connect, and nobody else."""
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(open_folder))
+    with listen(open_folder / "control"):
+        assert stat.S_IMODE(os.lstat(open_folder / "control").st_mode) == 0o660
+        code = (
+            "import os, socket, sys\nos.setgroups([]), os.setgid(int(sys.argv[2])), os.setuid(int(sys.argv[3]))\n"
+            "try:\n    socket.socket(socket.AF_UNIX).connect(sys.argv[1])\n"
+            "except OSError as error:\n    print(error.errno)\nelse:\n    print(0)\n"
+        )
+        for group, refused in ((os.lstat(open_folder / "control").st_gid, 0), (NOBODY, errno.EACCES)):
+            command = [sys.executable, "-c", code, str(open_folder / "control"), str(group), str(NOBODY)]
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
+            assert int(done.stdout) == refused
 
 
 @pytest.mark.parametrize("words", [("mark", "x"), ("split",), ("monitor", "--once"), ("offload",)])
