@@ -19,6 +19,7 @@ from swath.sim.preview.coverage import control_points
 from swath.sim.scanners.calibration_files import calibration_text
 from swath.sim.scanners.ouster_wire import config_table as ouster_config
 from swath.sim.scanners.ouster_wire import os1_metadata
+from swath.sim.scanners.rosette import config_table as rosette_config
 from swath.sim.scanners.srep_wire import config_table as srep_config
 from swath.sim.scanners.velodyne_wire import config_table as velodyne_config
 from swath.sim.scene.scene import Scene
@@ -131,6 +132,8 @@ def _scanner_config(plan: Plan, name: str, wires: dict[str, str]) -> dict[str, A
     source = f"scanner/{name}"
     if table.kind == "vlp16":
         config = velodyne_config(table, name, wires[source], wires[f"{source}/aux"])
+    elif table.kind == "rosette":
+        config = rosette_config(table, wires[source])
     elif table.kind == "os1":
         config = ouster_config(table, name, wires[source])
     else:

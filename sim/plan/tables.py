@@ -261,7 +261,7 @@ class RangeNoiseTable(Section):
     )
 
 
-ScannerKind = Literal["oscillating", "polygon", "monogon", "nutating", "risley", "vlp16", "os1"]
+ScannerKind = Literal["oscillating", "polygon", "monogon", "nutating", "risley", "rosette", "vlp16", "os1"]
 
 
 class ScannerTable(Section):
@@ -285,7 +285,9 @@ class ScannerTable(Section):
     )
     wedge_deg: Point = Field(default_factory=lambda: [10.0, 10.0], description="risley: angles of the two prisms")
     refractive_index: float = Field(1.51, gt=1.0, le=4.0, description="risley: refractive index of the prisms")
-    prism_ratio: float = Field(-0.7265625, description="risley: turns of the second prism for one turn of the first")
+    prism_ratio: float = Field(
+        -0.7265625, description="risley, rosette: turns of the second prism per turn of the first"
+    )
     encoder_counts: int = Field(4_194_304, ge=1000, le=2**30, description="counts in a turn of the shaft")
     tick_hz: int = Field(
         10_000_000, ge=100_000, le=1_000_000_000, description="frequency of its counter; vlp16, os1: fixed by the head"
@@ -304,6 +306,9 @@ class ScannerTable(Section):
     wavelength_nm: float = Field(1064.0, ge=300.0, le=2000.0, description="wavelength in vacuum")
     divergence_mrad: float = Field(0.5, ge=0.0, le=10.0, description="divergence of the beam, full angle")
     pulse_ns: float = Field(3.0, gt=0.0, le=50.0, description="length of the pulse; echoes closer together become one")
+    direction_sigma_deg: float = Field(
+        0.0, ge=0.0, le=5.0, description="rosette: sigma of each of the two angles that it reports"
+    )
     range_min_m: float = Field(20.0, ge=0.0, description="least range that is measured")
     range_max_m: float = Field(3000.0, gt=0.0, description="greatest range that is measured")
     reference_range_m: float = Field(1000.0, gt=0.0, description="range at which full reflectance gives full intensity")

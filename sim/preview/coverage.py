@@ -71,8 +71,8 @@ def fan_of(table: ScannerTable) -> Fan:
     """Return the fan of a scanner of the plan."""
     if table.kind in ("vlp16", "os1"):
         return Fan(0.0, math.pi, table.range_max_m, pulse_rate_hz(table), False)
-    installation = np.array(table.installation)
-    centre = math.atan2(installation[1, 2], installation[2, 2])
+    installation, axis = np.array(table.installation), 0 if table.kind == "rosette" else 2
+    centre = math.atan2(installation[1, axis], installation[2, axis])
     sine = table.kind == "nutating" or (table.kind == "oscillating" and table.motion == "sine")
     return Fan(centre, _half_angle_rad(table), table.range_max_m, pulse_rate_hz(table), sine)
 
@@ -391,17 +391,19 @@ def _overlap_percent(survey: Survey, strip: Strip) -> float:
 
 
 def _always_on(table: ScannerTable) -> bool:
-    return not table.on_lines_only or table.kind in ("vlp16", "os1")
+    return not table.on_lines_only or table.kind in ("vlp16", "os1", "rosette")
 
 
 def _pulse_bytes(table: ScannerTable) -> float:
     """Return the bytes of the log per pulse: the pulse's part of a datagram.
 
-    Datagrams are those of SREP/1, VLP-16's data packet and Ouster's RNG19_RFL8_SIG16_NIR16.
+    Datagrams are those of SREP/1, VLP-16's data packet, Ouster's RNG19_RFL8_SIG16_NIR16 and Livox' points of type 1.
     """
     if table.kind == "vlp16":
         return (1206 + LOG_MESSAGE_BYTES) / (192 if table.dual_return else 384)
     if table.kind == "os1":
         column = 12 + (16 if table.dual_return else 12) * OS1_BEAMS
         return (64 + 16 * column + LOG_MESSAGE_BYTES) / (16 * OS1_BEAMS)
+    if table.kind == "rosette":
+        return 14 + (36 + LOG_MESSAGE_BYTES) / 96
     return 8 + 8 * table.return_slots + (52 + LOG_MESSAGE_BYTES) / table.pulses_per_datagram

@@ -11,6 +11,7 @@ from swath.sim.flight.trajectory import Trajectory
 from swath.sim.plan.plan import Plan
 from swath.sim.scanners.line_heads import LineHead
 from swath.sim.scanners.ouster_wire import OusterWire
+from swath.sim.scanners.rosette import RosetteHead, RosetteWire
 from swath.sim.scanners.spinning_heads import Os1Head, Vlp16Head
 from swath.sim.scanners.srep_wire import SrepWire
 from swath.sim.scanners.velodyne_wire import VelodyneWire
@@ -46,6 +47,8 @@ def head_and_wire(plan: Plan, name: str, pps: PulsePerSecond | None, trajectory:
         return Vlp16Head(table, name), VelodyneWire(plan, name, pps, trajectory, lost_pps)
     if table.kind == "os1":
         return Os1Head(table, name), OusterWire(plan, name, pps, lost_pps)
+    if table.kind == "rosette":
+        return RosetteHead(table, name), RosetteWire(plan, name, pps, lost_pps)
     flight = tables.flight
     wire = SrepWire(table, name, pps, tables.host, flight.seed, noise=flight.noise, lost_pps=lost_pps)
     return LineHead(table, name), wire

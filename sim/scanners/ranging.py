@@ -63,7 +63,7 @@ class Ranging:
         intensity: IntensityScale | None = None,
     ) -> None:
         self._table, self._air, self._noise = table, air, noise
-        self._spinning = table.kind in ("vlp16", "os1")
+        self._spinning = table.kind in ("vlp16", "os1", "rosette")
         self._counts = intensity or (SPINNING_HEAD if self._spinning else LINE_SCANNER)
         self._key = generator(seed, "ranging", name).integers(2**64, dtype=np.uint64)
         self._scale = 1.0 + 1e-6 * table.true.range_scale_ppm
@@ -89,7 +89,7 @@ class Ranging:
         said_m = self._model_range(range_m, intensity, pulses.channel[pulse])
         said_m = self._air.device_range(said_m, from_height_m[pulse], to_height_m[pulse, slot])
         if self._noise:
-            said_m = said_m + self._sigma_m(intensity, depth_m) * _gauss(self._key, pulses.number[pulse], slot)
+            said_m = said_m + self._sigma_m(intensity, depth_m) * gauss(self._key, pulses.number[pulse], slot)
         width_ns = self._table.pulse_ns + 2e9 / LIGHT_MPS * depth_m
         there = intensity >= max(1.0, THRESHOLD * self._counts.full)
         there &= (said_m > 0.0) & (said_m >= self._table.range_min_m) & (said_m <= self._table.range_max_m)
@@ -175,7 +175,7 @@ def _beam_corrections(table: ScannerTable) -> FloatArray:
     return corrections
 
 
-def _gauss(key: np.uint64, number: Int64Array, slot: Int64Array) -> FloatArray:
+def gauss(key: np.uint64, number: Int64Array, slot: Int64Array | int) -> FloatArray:
     """Return (k,) standard normal numbers, each a function of pulse number and slot (k,) alone.
 
     Counters go through SplitMix64's mixer (Steele, Lea, Flood 2014), pairs through the Box-Muller transform.

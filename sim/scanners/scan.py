@@ -69,7 +69,7 @@ class Scanner:
 
     def _periods(self, stop_s: float) -> Iterator[tuple[float, float, bool]]:
         """Yield consecutive periods as (from, to, laser on)."""
-        if not self._table.on_lines_only or self._table.kind in ("vlp16", "os1"):
+        if not self._table.on_lines_only or self._table.kind in ("vlp16", "os1", "rosette"):
             yield 0.0, stop_s, True
             return
         at_s = 0.0

@@ -64,7 +64,9 @@ CASES = {
     "vlp16": Case({"kind": "vlp16", "dual_return": False}, low=True, stop_s=1.3),
     "vlp16 dual": Case({"kind": "vlp16", "dual_return": True}, low=True, stop_s=1.3),
     "os1": Case({"kind": "os1", "serial": "1"}, low=True, stop_s=1.3),
+    "rosette": Case({"kind": "rosette", "prf_hz": 25_000.0, "half_angle_deg": 35.0}, low=True, stop_s=1.3),
 }
+AHEAD_DOWN = [[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]]  # x down, z forward
 LOW_HEAD = {
     "scan_hz": 10.0,
     "true": SPINNING_ERRORS,
@@ -78,6 +80,9 @@ LOW_HEAD = {
 def fly(folder: Path, case: Case, atmosphere: dict[str, str]) -> Flown:
     """Fly the case through some air."""
     changes: dict[str, Any] = {"scanner": {"left": case.scanner | (LOW_HEAD if case.low else {})}}
+    if case.scanner.get("kind") == "rosette":
+        no_encoder = {"scan_angle_offset_deg": 0.0, "encoder_latency_us": 0.0}
+        changes["scanner"]["left"] |= {"true": SPINNING_ERRORS | no_encoder, "installation": AHEAD_DOWN}
     changes |= {"atmosphere": atmosphere} | (LOW_AND_SLOW if case.low else {})
     return fly_and_decode(folder, changes, case.stop_s)
 
@@ -116,6 +121,8 @@ def limits_of(case: Case, flown: Flown) -> FloatArray:
         return bound(flown, range_quantum_m=0.002, angle_quantum_rad=angle, time_quantum_s=1e-6)
     if kind == "os1":
         return bound(flown, range_quantum_m=0.001, angle_quantum_rad=0.0, time_quantum_s=1e-9)
+    if kind == "rosette":  # the diagonal of a cube of 1 mm; times of a packet's pulses are between those of its ends
+        return bound(flown, range_quantum_m=3**0.5 * 0.001, angle_quantum_rad=0.0, time_quantum_s=1e-7)
     return bound(flown, **SREP_24_BIT)
 
 
