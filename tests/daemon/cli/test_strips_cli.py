@@ -212,7 +212,7 @@ def test_numbers_before_and_after_are_shown_side_by_side(tmp_path: Path, capsys:
 
 
 def test_a_missed_quality_level_is_a_problem(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Standard output has the verdict, and stderr does not repeat it; beside JSON it is the only line for people."""
+    """Standard output has the verdict, which stderr does not repeat; with --json stderr has it instead."""
     folder = lifted(tmp_path / "now", 0.12)
     run(str(folder), "--level", "QL3")
     said = "strips do not meet QL2, because of its limit of 0.08 m RMSDz"

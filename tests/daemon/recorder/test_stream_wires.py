@@ -250,7 +250,7 @@ def test_two_heads_on_one_port_are_two_sources_and_strangers_are_named(tmp_path:
 
 
 def test_relative_ports_and_fifos_are_beside_the_configuration(tmp_path: Path) -> None:
-    """The recorder, the check and the replay run in another folder than that of the configuration."""
+    """The recorder, the check and the replay run in a folder that is not the configuration's."""
     folder = tmp_path / "rig"
     folder.mkdir()
     line = Pty(folder / "port")

@@ -74,7 +74,7 @@ def test_the_axes_of_the_map_bear_the_coordinates_of_the_crs(monkeypatch: pytest
 
 
 def test_small_maps_bear_the_coordinates_of_the_crs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each coordinate stands at the edge where the line of this easting or northing meets it."""
+    """Each coordinate is written where the line of its easting or northing meets the edge."""
     lines = line("a", "-500.0, 0.0", "500.0, 0.0"), line("b", "0.0, -500.0", "0.0, 500.0")
     figure, chart = drawn(FLAT + "".join(lines), monkeypatch), Chart(Survey(flat_plan(*lines)))
     maps = [axes for axes in figure.axes if not axes.get_xlabel() and axes.images and len(axes.get_xticks()) == 0]

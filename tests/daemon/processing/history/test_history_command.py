@@ -94,7 +94,7 @@ def test_page_pdf_and_csv_are_written(archive: Path, tmp_path: Path) -> None:
 
 
 def test_a_table_of_many_parameters_fits_a_sheet_and_dates_do_not_cover_each_other(archive: Path) -> None:
-    """Calibrations of one flight have one date: their marks stand beside each other."""
+    """Calibrations of one flight have the same date, so their marks are drawn side by side."""
     collected = collect([archive])
     (scanner,) = collected.scanners
     wide = replace(scanner.entries[0], sigmas=np.full(len(INDEX), 1e-3))

@@ -1,4 +1,4 @@
-"""RoboSense heads: packets put together by hand from the SDK's structures, the encoder, damage on the wire."""
+"""Tests RoboSense heads by packets built by hand from the SDK's structures and by the encoder, and with damage."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def parser_of(head: RobosenseHead, mode: int = 1) -> RobosenseParser:
 def packet(
     head: RobosenseHead, step: int = 20, blocks: int = 1, ranges: ArrayLike = 1000, first: int = 1000, light: int = 7
 ) -> bytes:
-    """Return a packet whose azimuths grow by a step every so many blocks."""
+    """Return a packet whose azimuths grow by a step (in 0.01°) after each group of so many blocks."""
     azimuth = (first + step * (np.arange(12) // blocks)) % 36_000
     return encode_msop(NOON, azimuth, np.broadcast_to(np.asarray(ranges), (12, 32)), light, head)
 
@@ -86,7 +86,7 @@ def old_header() -> bytes:
 
 
 def test_an_rs16_packet_computed_by_hand_is_decoded() -> None:
-    """A block holds two rounds of 16 lasers: laser 3 of block 2 at 111 + 8.4 µs, again at 111 + 63.9 µs."""
+    """A block holds two rounds of 16 lasers: laser 3 of block 2 fires at 111 + 8.4 µs and at 111 + 63.9 µs."""
     block = b"".join(struct.pack(">HB", 2000 + place, place) for place in range(32))
     rows = decode(msop_by_hand(old_header(), block, [9000 + 40 * at for at in range(12)]), RS16)
     assert len(rows) == 384
@@ -101,7 +101,7 @@ def test_an_rs16_packet_computed_by_hand_is_decoded() -> None:
 
 
 def test_dual_returns_of_an_rs16_lie_in_the_halves_of_a_block() -> None:
-    """In dual return a block is one round of 55.5 µs; the device information packet says so, the data do not."""
+    """In dual return a block is one round of 55.5 µs; only the device information packet reports this mode."""
     ranges = np.tile(np.repeat([2000, 1000], 16), (12, 1))
     rows = decode(packet(RS16, ranges=ranges), RS16, MODE_DUAL)
     assert len(rows) == 384
@@ -114,7 +114,7 @@ def test_dual_returns_of_an_rs16_lie_in_the_halves_of_a_block() -> None:
 
 
 def test_an_rs32_packet_computed_by_hand_is_decoded() -> None:
-    """Lasers 1 and 17 fire 1.44 µs apart; a block takes 55.52 µs; equal azimuths of pairs are dual return."""
+    """Lasers 1 and 17 fire 1.44 µs apart; a block takes 55.52 µs; pairs of equal azimuths mean dual return."""
     block = b"".join(struct.pack(">HB", 1000, 200) for _ in range(32))
     single = decode(msop_by_hand(old_header(), block, [100 + 20 * at for at in range(12)]), RS32)
     times = single["device_time_ns"].reshape(12, 32) - NOON_NS - 125_000
@@ -125,7 +125,7 @@ def test_an_rs32_packet_computed_by_hand_is_decoded() -> None:
 
 
 def test_a_helios_packet_computed_by_hand_is_decoded() -> None:
-    """Six bytes of seconds since 1970 and four of microseconds; distances in 2.5 mm; 1.73 µs a laser."""
+    """The stamp has six bytes of seconds since 1970 and four of µs; ranges count 2.5 mm; lasers are 1.73 µs apart."""
     header = bytes.fromhex("55aa055a") + bytes(16) + struct.pack(">HII", 0, 1_795_262_400, 250_125) + bytes(12)
     block = b"".join(struct.pack(">HB", 4000, 9) for _ in range(32))
     unit = msop_by_hand(header, block, [100 + 20 * at for at in range(12)])
@@ -138,7 +138,7 @@ def test_a_helios_packet_computed_by_hand_is_decoded() -> None:
 
 
 def test_points_start_ahead_of_the_axis() -> None:
-    """decoder_RS32.hpp: x forward = d cos v cos(a + h) + Rx cos a, y left = −d cos v sin(a + h) − Rx sin a."""
+    """decoder_RS32.hpp has forward d cos v cos(a + h) + Rx cos a, and left −d cos v sin(a + h) − Rx sin a."""
     file = encode_difop(RS32, np.linspace(-25, 15, 32), np.full(32, 8.0))
     parser = RobosenseParser(DeviceSettings("scanner/left", {}, {"geometry": file}), RS32)
     row = returns_of(parser.feed(Chunk("scanner/left", 1, packet(RS32, first=3000))))[:1]
@@ -151,7 +151,7 @@ def test_points_start_ahead_of_the_axis() -> None:
 
 
 def test_a_jump_over_a_part_of_the_circle_takes_its_time() -> None:
-    """From 100.6° to 280.6° at 0.2° in 55.52 µs: 180° are 900 blocks; azimuths go on with the usual turn."""
+    """From 100.6° to 280.6°, at 0.2° in 55.52 µs, 180° last 900 blocks; within a block the usual rotation holds."""
     azimuth = [10_000, 10_020, 10_040, 10_060, *(28_060 + 20 * at for at in range(8))]
     unit = encode_msop(NOON, azimuth, np.full((12, 32), 1000), 1, RS32)
     rows = decode(unit, RS32)
@@ -171,7 +171,7 @@ def test_single_returns_are_flagged_by_the_mode_of_the_information_packet(mode: 
 
 
 def test_angles_of_information_packets_are_read() -> None:
-    """RS-LiDAR-16 in either unit, the others with sign and value; anywhere in a capture."""
+    """An RS-LiDAR-16 has one of two units, the others sign and value; the packet may be anywhere in a capture."""
     for head in HEADS.values():
         elevation, azimuth, mode = read_angles(b"pcap" + encode_difop(head, angles(head), 1.5, mode=2) + b"more", head)
         np.testing.assert_allclose(elevation, angles(head), atol=1e-9)

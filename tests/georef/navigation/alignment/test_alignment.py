@@ -86,7 +86,7 @@ def test_starts_anywhere_in_a_flight_are_as_accurate_as_their_sigmas(name: str, 
         errors.append(normalised(flight, start))
     each = np.array(errors)
     spread = np.sqrt((each**2).mean(axis=0))
-    # 21 normal numbers have 1 ± 0.15; roll and pitch share an accelerometer bias, so they count as hardly two.
+    # 21 normal numbers have 1 ± 0.15; roll and pitch share a bias and count as little more than one.
     assert (spread[2:] > 0.55).all()
     assert (spread[2:] < 1.45).all()
     assert (spread[:2] < 2.0).all()
