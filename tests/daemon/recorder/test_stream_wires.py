@@ -9,6 +9,7 @@ import socket
 import termios
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -24,7 +25,7 @@ from swath.daemon.log.parsers import stored_parsers
 from swath.daemon.log.reader import open_logs
 from swath.daemon.replay.units import close_outputs, open_outputs
 from swath.daemon.replay.wire_player import TcpOutput
-from swath.drivers.driver import KINDS, STREAM_TRANSPORTS, Driver, all_drivers
+from swath.drivers.driver import KINDS, RECEIVER_RECORDS, STREAM_TRANSPORTS, Driver, all_drivers
 from swath.drivers.transports.base import TransportError
 from swath.drivers.transports.opening import open_transport
 from swath.drivers.transports.spec import TransportSpec, parse_transport
@@ -43,6 +44,7 @@ STREAMS = [
     for driver in all_drivers(kind).values()
     if set(STREAM_TRANSPORTS) <= set(driver.transports)
 ]
+RECEIVERS_INSIDE = {driver.protocol for driver in all_drivers("gnss").values() if "imu" in driver.transports}
 PIECE_BYTES = 700
 MOST_BYTES = 20_000
 
@@ -108,6 +110,8 @@ def test_every_stream_is_recorded_and_read_over_every_wire(tmp_path: Path) -> No
                 name = f"{driver.protocol}-{wire}"
                 text, send = stack.enter_context(sending_end(wire, tmp_path, name))
                 config += f'[{driver.kind}.{name}]\ntransport = "{text}"\nprotocol = "{driver.protocol}"\n'
+                if driver.kind == "imu" and driver.protocol in RECEIVERS_INSIDE:
+                    config += f'[gnss.in-{name}]\ntransport = "imu:{name}"\nprotocol = "{driver.protocol}"\n'
                 sends[f"{driver.kind}/{name}"] = send, sent[f"{driver.kind}/{driver.protocol}"]
         recorder = stack.enter_context(Recorder(tmp_path / "rig", config))
         recorder.wait_said("device_opened", times=len(sends))
@@ -118,6 +122,7 @@ def test_every_stream_is_recorded_and_read_over_every_wire(tmp_path: Path) -> No
         assert recorder.stop() == 0, recorder.stderr()
     content = read_log(logs)
     (session,) = open_logs([logs])
+    heard_inside: Counter[str] = Counter()
     for source, (_, data) in sends.items():
         assert content.data(source) == data, source
         if source.endswith("-udp"):  # one unit a datagram
@@ -130,6 +135,15 @@ def test_every_stream_is_recorded_and_read_over_every_wire(tmp_path: Path) -> No
         assert whole.counters.messages.total() > 0, source
         assert cut.counters == whole.counters, source
         assert found.counts == expected.counts, source
+        if source.startswith("imu/") and source[4:].rpartition("-")[0] in RECEIVERS_INSIDE:
+            receiver, inside = stored_parsers(session.attachments())[0][f"gnss/in-{source[4:]}"], Heard()
+            for time_ns, unit in content.units[source]:
+                inside.add(receiver.feed(Chunk(source, time_ns, unit)))
+            kinds = {kind.__name__ for kind in RECEIVER_RECORDS}
+            assert inside.counts == {kind: count for kind, count in found.counts.items() if kind in kinds}, source
+            heard_inside += inside.counts
+    assert heard_inside["TimeMessage"] > 0
+    assert heard_inside["GnssFix"] > 0
 
 
 def test_check_reads_a_receiver_over_every_wire_and_names_another_protocol(tmp_path: Path) -> None:
