@@ -170,7 +170,7 @@ class TestPps:
 
 
 def test_the_second_recorder_is_the_first_with_places_of_its_own(tmp_path: Path) -> None:
-    """Without the comments, the units differ in nothing else."""
+    """Apart from comments, the two units have no other difference."""
 
     def lines(unit: Path) -> list[str]:
         return [line for line in unit.read_text().splitlines() if not line.startswith("#")]

@@ -175,7 +175,7 @@ def test_only_the_owner_of_the_recorder_can_connect(tmp_path: Path, open_folder:
 
 
 def test_the_service_s_group_may_connect(open_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the unit the socket belongs to the unit's group, whose members may connect, and nobody else."""
+    """In a service the socket belongs to the unit's group; its members may connect, other users may not."""
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(open_folder))
     with listen(open_folder / "control"):
         assert stat.S_IMODE(os.lstat(open_folder / "control").st_mode) == 0o660

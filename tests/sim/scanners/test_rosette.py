@@ -1,4 +1,4 @@
-"""The rosette: its directions and packets, decoded by the project's own parser, and what a plan cannot ask of it."""
+"""Tests the rosette: directions and packets, decoded by this project's parser, and keys that a plan cannot have."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A head of two angles from its packets to a calibration: points within their sigmas, the boresight within its own."""
+"""Tests a head of two angles from packets to calibration: points and boresight are within their sigmas."""
 
 from __future__ import annotations
 
