@@ -210,7 +210,7 @@ def test_xt32_points_match_nebula() -> None:
     rows = returns_of(feed(parser, payloads("hesai/nebula_xt32.pcap.gz")))
     cloud = xyz(read_pcd(FIXTURES / "hesai" / "nebula_xt32_golden_1673400678101968885.pcd.gz", XYZ))
     assert len(cloud) == 63021
-    rows["encoder_rad"] -= XT32.offset_ns[rows["channel"]] * (XT32_RPM / 60 * 2 * np.pi * 1e-9)
+    rows["encoder_rad"] -= XT32.offset_ns[0, rows["channel"]] * (XT32_RPM / 60 * 2 * np.pi * 1e-9)
     assert are_near(cloud, points_s(model_of("hesai-xt32", parser), rows), 1e-4).all()
 
 
