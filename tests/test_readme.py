@@ -203,7 +203,7 @@ EXERCISED: dict[str, Callable[[Path], None]] = {
     "sudo swath setup --apply": run_setup,
     "sudo swath doctor /etc/swath/swath.toml": run_doctor,
     "swath monitor": run_beside_a_recorder,
-    'sudo swath mark "line 4 start"': run_beside_a_recorder,
+    'swath mark "line 4 start"': run_beside_a_recorder,
     "swath import": point_to_the_page,
     "swath export": point_to_the_page,
     "swath offload /var/lib/swath /mnt/usb": run_offload,

@@ -34,6 +34,8 @@ PIPE_CLOSED = 141  # 128 + SIGPIPE
 CLEANING_S = 5.0  # after an interrupt, during which another one does not disturb the removal of unfinished files
 WITHOUT_FILES = ("run", "mark", "split", "check", "monitor", "live", "info", "devices", "doctor", "setup")
 
+COMPLETE_VARIABLE = "_SWATH_COMPLETE"  # set by the script of `swath completion` when it asks
+
 HELP = """Record, georeference and calibrate an airborne laser scanner.
 
 `swath check CONFIG` tests every device; `swath run CONFIG` records.
@@ -84,6 +86,7 @@ COMMANDS = (
     Listed("warm-up", "Compile the computing code before the flight.", "Setup"),
     Listed("doctor", "Check whether this computer can record safely.", "Setup"),
     Listed("setup", "Show or send the set-up messages of the devices.", "Setup"),
+    Listed("completion", "Print the script for completion in a shell.", "Setup"),
     Listed("devices", "List the supported protocols and their records.", "Setup"),
 )
 
@@ -156,6 +159,8 @@ class _Interrupts:
 
 def run_app(arguments: list[str]) -> int:
     """Run a command; every outcome becomes an exit code and at most one line for each error."""
+    if COMPLETE_VARIABLE in os.environ:
+        return _complete()
     if not arguments:
         make_app(None)(args=["--help"], prog_name="swath", standalone_mode=False)
         return int(ExitCode.USAGE)
@@ -183,6 +188,28 @@ def run_app(arguments: list[str]) -> int:
         written.remove_empty_folders()
         written.begin()
     return int(result) if isinstance(result, int) else int(ExitCode.OK)
+
+
+def _complete() -> int:
+    """Answer a shell that completes: names of commands without importing them, or the options of the one named."""
+    from typer._completion_classes import completion_init
+
+    completion_init()
+    line = os.environ.get("COMP_WORDS") or os.environ.get("_TYPER_COMPLETE_ARGS", "")
+    words = line.split()
+    begun = words[1] if len(words) > 2 or (len(words) == 2 and line[-1:].isspace()) else None
+    made = make_app(begun) if any(listed.name == begun for listed in COMMANDS) else _names_app()
+    made(args=[], prog_name="swath", complete_var=COMPLETE_VARIABLE, standalone_mode=False)
+    return int(ExitCode.OK)
+
+
+def _names_app() -> typer.Typer:
+    """Return an application that knows the commands' names and summaries only."""
+    made = typer.Typer(name="swath", help=HELP, add_completion=False)
+    made.callback(help=HELP)(_callback)
+    for listed in COMMANDS:
+        made.command(listed.name, short_help=listed.summary, help=listed.summary)(lambda: None)
+    return made
 
 
 def _drop_output() -> None:
