@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime as dt
 import json
 from pathlib import Path
+from typing import Any
 
 import cantools
 import numpy as np
@@ -50,7 +51,7 @@ def candump(flown: Flown) -> str:
     """Return what a CANmod.gps sends in a flight, by the maker's DBC: samples of its IMU and a fix a second."""
     session = flown.session()
     found = read_navigation_log(session, NavigationSources(flown.config, session.attachments()))
-    database = cantools.database.load_file(DBC_PATH)
+    database: Any = cantools.database.load_file(DBC_PATH)
     lines: list[tuple[int, str]] = []
 
     def add(time_ns: int, name: str, values: dict[str, float]) -> None:
