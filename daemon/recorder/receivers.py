@@ -189,7 +189,10 @@ class Receiver(threading.Thread, ABC):
 
     @abstractmethod
     def take(self, timeout_s: float) -> int | None:
-        """Wait for data and pass it on; return the host time of the newest unit, or None if there was none."""
+        """Wait for data and pass it on; return the host time that the kernel gave the newest unit.
+
+        None if there was no unit; 0 where the kernel gives no time, so that a unit may have waited since any moment.
+        """
 
     @abstractmethod
     def receive_once(self) -> None:
@@ -309,7 +312,7 @@ class UnitReceiver(Receiver):
         for units_seen in self._units_seen:
             for block, log_time_ns in zip(blocks, times, strict=True):
                 units_seen(log_time_ns, block)
-        return int(times[-1][-1])
+        return 0 if blocks[-1].kernel_realtime_ns is None else int(times[-1][-1])
 
     def receive_once(self) -> None:
         """Wait once; then report the state of the device, and losses."""

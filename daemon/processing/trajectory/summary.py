@@ -116,7 +116,7 @@ def start_words(start: Start) -> str:
     roll, pitch, heading = np.degrees(start.attitude_rad)
     sigma = np.degrees(start.attitude_sigma_rad)
     angles = f"roll {roll:.2f}° and pitch {pitch:.2f}° (± {max(sigma[:2]):.2f}°), heading {heading % 360.0:.2f}°"
-    return f"{how}{'; ' if how else ''}{angles} (± {sigma[2]:.2f}°)".replace("-", "−")
+    return f"{how}{'; ' if how else ''}{angles.replace('-', '−')} (± {sigma[2]:.2f}°)"
 
 
 def summary_head(

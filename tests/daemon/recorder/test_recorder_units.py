@@ -24,12 +24,16 @@ from swath.daemon.log.host_clock import HostClock
 from swath.daemon.log.mcap.encode import MESSAGE_HEADER_BYTES, EncodedBlock, encode_block
 from swath.daemon.log.mcap.writer import PartWriter
 from swath.daemon.log.parts import Attachment, Parts
-from swath.daemon.recorder.receivers import PpsReceiver, Receiver, Shared, WireTrouble
+from swath.daemon.log.wires import Wire
+from swath.daemon.recorder.receivers import PpsReceiver, Receiver, Shared, UnitReceiver, WireTrouble
 from swath.daemon.recorder.run import a_restart_helps_nobody, sentence, stuck_threads
 from swath.daemon.recorder.service_manager import ServiceManager
 from swath.daemon.recorder.writer import Recorder, RecorderSettings, WriterHealth, Writing
 from swath.drivers.session import Session
-from swath.drivers.transports.base import PpsSource, RawEdge, TransportCounters
+from swath.drivers.transports.base import PpsSource, RawEdge, TransportCounters, UnitBlock
+from swath.drivers.transports.serial_port import SerialTransport
+from swath.drivers.transports.spec import parse_transport
+from tests.daemon.builders import Pty
 from tests.daemon.journal import journal_of
 from tests.daemon.log_check import official_counts, read_log
 
@@ -257,6 +261,25 @@ def test_edges_overwritten_in_the_kernel_are_counted_as_lost_units(overwrites: b
     assert seen == [7, 8, 11, 12, 15, 2, 3]
     last = [item.count for item in queue.take_all() if item.count is not None][-1]
     assert (last.units, last.lost_kernel) == (7 + lost, lost)
+
+
+# --- serial bytes at the stop ---------------------------------------------------------------------------------------
+
+
+def test_all_bytes_that_wait_in_a_serial_port_at_the_stop_are_taken(tmp_path: Path) -> None:
+    """More of them than a read returns wait, and the time of a read does not tell when they came."""
+    clock, channels, queue = HostClock(), ChannelTable(), BlockQueue(1 << 20)
+    pty = Pty(tmp_path / "rover")
+    session: Session[UnitBlock] = Session(lambda: SerialTransport(parse_transport(f"serial:{tmp_path / 'rover'}")))
+    wire = Wire("gnss/rover", "/gnss/rover/raw", "x-swath-serial", "other", {"protocol": "nmea"})
+    receiver = UnitReceiver(wire, session, Shared(clock, queue, channels, Events(clock, queue, channels)))
+    receiver.receive_once()
+    waiting = os.urandom(10_000)
+    pty.write(waiting)
+    receiver.finish()
+    pty.unplug()
+    last = [item.count for item in queue.take_all() if item.count is not None][-1]
+    assert (last.bytes, last.units) == (len(waiting), 3)
 
 
 # --- a wire's own trouble --------------------------------------------------------------------------------------------
