@@ -234,11 +234,9 @@ def test_exactly_the_commands_of_the_readme_are_exercised() -> None:
 
 
 def test_commands_that_need_root_are_written_with_sudo() -> None:
-    """Root opens devices and the control socket; only the logs' owner makes a copy that the group may read."""
+    """Root opens devices; only the logs' owner makes a copy that the group may read."""
     for page in (ROOT / "README.md", ROOT / "docs/installation.md", ROOT / "docs/recording.md"):
-        for line in re.findall(
-            r"^\$ (.*\bswath (?:mark|split|recover|doctor|setup|check)\b.*)", page.read_text(), re.M
-        ):
+        for line in re.findall(r"^\$ (.*\bswath (?:recover|doctor|setup|check)\b.*)", page.read_text(), re.M):
             if "--offline" in line or (line.startswith("swath setup") and "--apply" not in line):
                 continue
             assert line.startswith("sudo -u swath swath" if " recover " in line else "sudo swath"), page.name

@@ -159,6 +159,7 @@ def _compare(
     from swath.daemon.processing.carried_verdict import acceptance
     from swath.daemon.processing.earlier_runs import refuse_existing
     from swath.daemon.processing.pages.names import STRIPS
+    from swath.daemon.processing.strip_agreement import MORE_CELLS
     from swath.daemon.processing.strips.compare import RECORD, StripsOptions, compare_strips, rules_of
     from swath.daemon.processing.strips.console import comparison_lines
 
@@ -180,8 +181,9 @@ def _compare(
     print(json.dumps(done.record, indent=2) if as_json else "\n".join(map(one_line, lines)))
     for line in warnings:
         print(one_line(f"swath: {line}"), file=sys.stderr)
-    if done.problem:
-        raise UserError(done.problem if as_json else acceptance(done.record["verdict"]))  # stdout has the verdict
+    if done.problem:  # stdout has the verdict
+        remedy = MORE_CELLS if done.now.agreement.no_verdict else ""
+        raise UserError(done.problem if as_json else acceptance(done.record["verdict"]) or remedy)
 
 
 def _adjust(

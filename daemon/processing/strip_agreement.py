@@ -32,6 +32,7 @@ from swath.georef.mapping.frame import Mapping
 from swath.georef.progress import Tell, silent
 
 BLOCK_POINTS = 500_000
+MORE_CELLS = "add tiles with smooth open ground where strips overlap, or set another --cell"
 BORDER_M = 5.0  # around a flight's points in t, so that the map's corners hold them all
 LIMITS = {
     "pulses_m2": "{:g} pulses per m²",
@@ -102,8 +103,8 @@ class Agreement:
         there = f"{self.cells:,} {'cell' if self.cells == 1 else 'cells'} of {self.cell_m:g} m in "
         there += f"{self.places} {'place' if self.places == 1 else 'places'}"
         return (
-            f"no verdict: strips were compared in {there}, but a verdict needs {FEWEST_CELLS} in {FEWEST_PLACES}: add "
-            "tiles with smooth open ground where strips overlap, or set another --cell"
+            f"no verdict: strips were compared in {there}, but a verdict needs {FEWEST_CELLS} in {FEWEST_PLACES}: "
+            f"{MORE_CELLS}"
         )
 
     @property

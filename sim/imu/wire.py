@@ -64,16 +64,17 @@ CM_ BO_ 256 "Counter at the end of the sample's interval; sent after X, Y and Z 
 CM_ BO_ 260 "Counter at the last PPS edge.";
 """
 DBC_AXIS = """BO_ {identifier} {axis}: 8 IMU
- SG_ force : 0|32@1- ({force_unit:g},0) [-214|214] "m/s2" Vector__XXX
- SG_ rate : 32|32@1- ({rate_unit:g},0) [-10.7|10.7] "rad/s" Vector__XXX
+ SG_ force : 0|32@1- ({force_unit:g},0) [-{most_force:.15g}|{most_force:.15g}] "m/s2" Vector__XXX
+ SG_ rate : 32|32@1- ({rate_unit:g},0) [-{most_rate:.15g}|{most_rate:.15g}] "rad/s" Vector__XXX
 """
 
 
 def dbc_text(table: ImuTable) -> str:
     """Return the DBC of a unit of the plan."""
+    units = {"force_unit": FORCE_UNIT_MPS2, "rate_unit": RATE_UNIT_RADPS}
+    ranges = {"most_force": LARGEST[0], "most_rate": LARGEST[3]}
     axes = "\n".join(
-        DBC_AXIS.format(identifier=257 + number, axis=axis, force_unit=FORCE_UNIT_MPS2, rate_unit=RATE_UNIT_RADPS)
-        for number, axis in enumerate("XYZ")
+        DBC_AXIS.format(identifier=257 + number, axis=axis, **units, **ranges) for number, axis in enumerate("XYZ")
     )
     bits = table.tick_bits
     return DBC.format(bits=bits, most=2**bits - 1, axes=axes, latch_bytes=bits // 8)

@@ -22,6 +22,7 @@ AIRCRAFT = Path(__file__).parents[2] / "fixtures/config/aircraft.toml"
 WEEK, MONDAY_S = 2423, 86_400 + 9 * 3600 + 18  # 2026-06-15T09:00:00Z in GPS time
 START_NS = 1_781_514_000 * 1_000_000_000  # the same as Unix time
 PPM, OFFSET_NS = -12.0, 20_000_000
+NOT_FLOWN = ("corrections/base", "raw/radar")  # the simulation has no base station and no radar
 SOURCES = ("gnss/rover", "imu/main", "pps/main", "scanner/left", "scanner/left/aux")
 LATE_S = 3e-5  # delay of a stamp
 TICKS = 10_000_000  # of the scanner's counter per second

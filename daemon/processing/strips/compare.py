@@ -24,7 +24,7 @@ from swath.daemon.processing.carried_verdict import points_verdicts, refusal, to
 from swath.daemon.processing.flights.read import GeorefOptions, verdicts_of
 from swath.daemon.processing.pages.head import head_of_flights, head_of_sidecars
 from swath.daemon.processing.quicklook.product_facts import crs_of
-from swath.daemon.processing.strip_agreement import Agreement, difference_of
+from swath.daemon.processing.strip_agreement import MORE_CELLS, Agreement, difference_of
 from swath.daemon.processing.strips.inputs import Strips, strips_of_files, strips_of_flight
 from swath.daemon.processing.user_errors import as_user_error, finite
 from swath.georef.mapping.frame import MappingError
@@ -203,8 +203,8 @@ class Judgement:
             words, level_of = one.words.partition("; run swath")[0], Level.UNUSABLE if far else Level.CARE
             reasons.append(Reason(level_of, one.effect.name, words, remedy, 1.0 if far else one.edge_m / MATTERS_M))
         if self.agreement.no_verdict:
-            what, _, remedy = self.agreement.no_verdict.partition(": add ")
-            reasons.append(Reason(Level.CARE, "cells", what, f"add {remedy}", 0.0))
+            what = self.agreement.no_verdict.removesuffix(f": {MORE_CELLS}")
+            reasons.append(Reason(Level.CARE, "cells", what, MORE_CELLS, 0.0))
         elif level is not None and (broken := self.agreement.broken(level)):
             what = f"strips do not meet {level}, because of its limit of {', '.join(broken)}"
             reasons.append(Reason(Level.UNUSABLE, "level", what, "calibrate, or correct the trajectory (--adjust)"))

@@ -15,7 +15,6 @@ from rich.console import Console
 from swath.daemon.cli import progress
 from swath.daemon.cli.main import run_app
 from swath.daemon.cli.progress import COMPILING, Display, progress_bar
-from swath.daemon.errors import ExitCode
 from swath.georef.progress import BYTES
 from tests.daemon.builders import INFO, run_python, write_part
 from tests.daemon.one_line import fly
@@ -151,7 +150,10 @@ def test_a_bar_on_a_terminal_disappears(monkeypatch: pytest.MonkeyPatch) -> None
     assert written.getvalue().endswith("\x1b[2K")  # the bar's line is erased
 
 
-def test_compiling_is_told_once_with_the_time_it_took(capsys: pytest.CaptureFixture[str]) -> None:
+def test_compiling_is_told_once_with_the_time_it_took(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(progress, "LEAST_TOLD_S", 1e-9)
     with progress_bar(compiling=True):
         numba.njit(lambda x: 7 * x)(2)
         numba.njit(lambda x: 8 * x)(2)
@@ -171,13 +173,13 @@ def test_commands_for_the_aircraft_do_not_load_the_compiler(tmp_path: Path, comm
     logs, out = tmp_path / "logs", tmp_path / "out"
     logs.mkdir()
     out.mkdir()
-    write_part(logs / f"{INFO.session_id}_0.mcap", finish=command != "recover")
+    write_part(logs / f"{INFO.session_id}_0.mcap", finish=command != "recover")  # only its index is missing
     arguments = [command, str(logs), *([] if command in ("info", "recover") else [str(out)])]
     if command == "offload":
         arguments.append("--same-disk")
     run = run_python(f"code = cli.run_app({arguments!r})\nprint('ended:', code, 'numba' in sys.modules)")
-    expected = ExitCode.DAMAGE if command == "recover" else ExitCode.OK
-    assert run.stdout.splitlines()[-1] == f"ended: {int(expected)} False", run.stdout + run.stderr
+    assert run.stdout.splitlines()[-1] == "ended: 0 False", run.stdout + run.stderr
+    assert command != "recover" or list(logs.glob("*.recovered.mcap"))
 
 
 def test_json_on_stdout_is_not_mixed_with_progress(

@@ -368,7 +368,7 @@ class TestWires:
         )
         facts = FlightFacts(1.0, SOURCES, (), ())
         outputs, others = open_wires(config, facts)
-        assert (sorted(outputs), others) == (sorted(SOURCES), {})
+        assert (sorted(outputs), others) == (sorted([*SOURCES, "raw/radar"]), {})
         for output in outputs.values():
             output.close()
 

@@ -63,6 +63,7 @@ def read(folder: Path, flown: Flown) -> Trajectory:
 
 
 class TestSmoothed:
+    @pytest.mark.slow
     def test_the_trajectory_matches_the_truth_within_its_sigmas(self, flown: Flown, made: Path) -> None:
         trajectory, truth = read(made, flown), flown.truth()
         inside = truth.fates(trajectory.time_ns) == 0

@@ -135,7 +135,8 @@ def log(made: Cast, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
             session=SimpleNamespace(session_id="second-flight", parts=[SimpleNamespace(path=path)]),
         )
         sources = SimpleNamespace(attachments={})
-        check([logged.session], [SimpleNamespace(config=None, sources=sources, mapping=Mapping("EPSG:32632"))])
+        setup = SimpleNamespace(config=None, sources=sources, scanners=(), mapping=Mapping("EPSG:32632"))
+        check([logged.session], [setup])
         return KeptFlight(flight, [logged], [])
 
     monkeypatch.setattr(validate_run, "read_flight", read)

@@ -43,6 +43,7 @@ def test_records_of_scanners_that_are_gone_are_found_by_their_ids(tmp_path: Path
     assert stale_records(tmp_path / "none.json", {"left"}) == []
 
 
+@pytest.mark.slow
 def test_view_replaces_its_page_only_if_asked(viewed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     copy = Path(shutil.copytree(viewed, tmp_path / "out"))
     page = copy / "view/index.html"
@@ -64,6 +65,7 @@ def test_view_replaces_its_page_only_if_asked(viewed: Path, tmp_path: Path, caps
     assert not any(name.startswith(".") for name in names)
 
 
+@pytest.mark.slow
 def test_georef_removes_the_page_of_points_that_it_replaces(
     flown: Flown, viewed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

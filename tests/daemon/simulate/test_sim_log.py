@@ -23,7 +23,7 @@ from swath.daemon.replay.units import timed_units
 from swath.daemon.simulate.into_log import SimReport, fly_into_log, virtual_boot_id
 from tests.daemon.commands import swath
 from tests.daemon.log_check import LogContent, official_counts, read_log
-from tests.daemon.standin import PPM, SOURCES, START_NS, Clock, Standin, Unit, aircraft_config
+from tests.daemon.standin import NOT_FLOWN, PPM, SOURCES, START_NS, Clock, Standin, Unit, aircraft_config
 
 SECONDS, SEED = 12.0, 3
 
@@ -84,7 +84,7 @@ class TestUnits:
         channels = {one.topic: one for one in summary.channels.values()}
         for device in config.devices():
             for suffix, spec in (("", device.transport), ("/aux", device.auxiliary)):
-                if spec is None or device.source == "corrections/base":  # the simulation has no base station
+                if spec is None or device.source in NOT_FLOWN:
                     continue
                 wire = make_wire(device, spec, suffix)
                 channel = channels[wire.topic]
@@ -272,4 +272,4 @@ class TestParts:
 
     def test_every_source_of_a_flight_has_a_port(self, tmp_path: Path) -> None:
         ports = Routes.of(aircraft_config(tmp_path)).ports
-        assert sorted(ports) == sorted([*SOURCES, "corrections/base"])
+        assert sorted(ports) == sorted([*SOURCES, *NOT_FLOWN])

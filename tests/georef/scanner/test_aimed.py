@@ -61,6 +61,7 @@ def covariance_of(points: FloatArray) -> FloatArray:
     return np.cov(points.T)[np.triu_indices(3)]
 
 
+@pytest.mark.slow
 def test_sigmas_hold_both_angles() -> None:
     """Range, azimuth and elevation are drawn through the formula itself; the sample variance scatters by 1 %."""
     azimuth, elevation, range_m, draws = 0.7, -0.9, 80.0, 40_000

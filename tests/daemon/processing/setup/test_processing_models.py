@@ -51,7 +51,8 @@ def test_a_scanner_without_declared_beams_is_not_taken_for_a_line_scanner() -> N
     """srep's parser, which has no table of beams, is given under the name of a head that has one."""
     table = ScannerConfig.model_validate({"transport": "udp:0.0.0.0:2368", "protocol": "velodyne-vlp16"})
     with pytest.raises(
-        ValueError, match="protocol velodyne-vlp16: its parser has no beam table and it is not a line scanner"
+        ValueError,
+        match="velodyne-vlp16: its parser has no beam table, its returns have no elevation, and it is not",
     ):
         geometry_of(table, SrepParser(DeviceSettings("scanner/left", {"mirror_factor": 2.0})))
 
