@@ -189,6 +189,12 @@ class HesaiHead:
             times = np.where(ranges.astype(np.int64) * unit_mm < NEAR_MM, self.near_ns[states], times)
         return times
 
+    @property
+    def bytes_per_s(self) -> float:
+        """The most that the head sends: its usual packets in the return mode with the fewest rounds in a packet."""
+        rounds = self.blocks // max(map(echoes_of, self.modes))
+        return 1e9 * self.packet_dtype().itemsize / (rounds * self.round_ns)
+
     def last_ns(self, mode: int) -> int:
         """Return the time from the packet's time to its last firing."""
         return int(self.round_start_ns(self.blocks // echoes_of(mode))[-1] + self.offset_ns.max())

@@ -391,6 +391,7 @@ def _driver(protocol: str, head: HesaiHead) -> Driver:
         needs=("installation",),
         wavelength_nm=905.0,
         eight_bit_intensity=True,
+        bytes_per_s=head.bytes_per_s,
     )
 
 

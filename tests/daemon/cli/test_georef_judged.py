@@ -145,10 +145,11 @@ def test_unusable_points_exit_with_1_however_well_strips_agree(
 ) -> None:
     capsys.readouterr()
     assert run_app(["strips", str(points)]) == ExitCode.PROBLEM
-    said, line = capsys.readouterr(), f"not to be used: trajectory {judged.trajectory('judged')}: {SIGN}"
-    assert said.out.startswith(f"Not to be used: trajectory {judged.trajectory('judged')}: ")
+    said = capsys.readouterr()
+    assert said.out.startswith(f"Not to be used: trajectory {judged.trajectory('judged')}: {SIGN}")
     assert said.out.count(str(judged.trajectory("judged"))) == 1
-    assert said.err == f"swath: {line}; use --accept-verdict to accept it\n"  # nothing is said about the strips
+    # nothing is said about the strips, and stdout has the reason
+    assert said.err == 'swath: the verdict is "not to be used"; use --accept-verdict to accept it\n'
 
 
 def test_strips_of_unusable_points_are_compared_with_the_users_override(

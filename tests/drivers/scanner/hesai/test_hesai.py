@@ -475,3 +475,9 @@ def test_impossible_gps_packets_are_counted(at: int, new: bytes) -> None:
     assert parser.counters.errors == {"bad_gps": 1}
     assert parser.counters.bytes_skipped == 512
     assert len(clock_of(records)) == 1
+
+
+def test_the_highest_rates_are_those_of_the_data_sheets() -> None:
+    """PandarXT-32: 1,280,000 points a second in dual return, 256 a packet; PandarQT: 768,000, 256 a packet."""
+    assert XT32.bytes_per_s == pytest.approx(1_280_000 / 256 * 1080)
+    assert QT64.bytes_per_s == pytest.approx(768_000 / 256 * 1072)
