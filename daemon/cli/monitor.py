@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
+import select
+import sys
+import termios
 import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from swath.daemon.errors import ExitCode, one_line
+from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.log.directory import DEFAULT_CONFIG, log_directory
 
 if TYPE_CHECKING:
@@ -18,6 +25,9 @@ if TYPE_CHECKING:
     from swath.daemon.monitor.display import Monitor
 
 EVENTS_SHOWN = 8
+MARK_KEY = "m"
+MARK_TEXT = "marked in swath monitor"
+KEYS = f"{MARK_KEY}: write a mark into the log; Ctrl-C: leave"
 FIRST_STATUS_S = 3.0  # a recorder writes its first status one second after its start
 STATE_STYLE = {"receiving": "green", "silent": "red", "stuck": "red", "absent": "red", "opening": "yellow"}
 EXIT = {"recording": ExitCode.OK, "degraded": ExitCode.PROBLEM, "not recording": 2}
@@ -39,15 +49,16 @@ def command(
 ) -> None:
     """Show the state of each source (rate, age, losses, time status), the disk and the latest events.
 
-    Reads the growing log only; it does not contact the recorder. With --once the exit code is 0 for recording,
-    1 for degraded, 2 for not recording.
+    Reads the growing log only; on a terminal the key m asks the recorder for a mark. With --once the exit code is 0
+    for recording, 1 for degraded, 2 for not recording.
     """
     from rich.console import Console
     from rich.live import Live
 
     from swath.daemon.monitor.display import Monitor
 
-    monitor = Monitor(log_directory(where), decode=decode)
+    directory = log_directory(where)
+    monitor = Monitor(directory, decode=decode)
     if once:
         raise typer.Exit(int(EXIT[_once(monitor, as_json)]))
     console = Console()
@@ -57,11 +68,51 @@ def command(
             found = monitor.snapshot()
             print(json.dumps(found) if as_json else one_line(found["sentence"]), flush=True)
             time.sleep(every)
-    with Live(console=console, auto_refresh=False, screen=True) as live:
+    foot = KEYS
+    with _keys() as pressed, Live(console=console, auto_refresh=False, screen=True) as live:
         while True:
             monitor.poll()
-            live.update(page(monitor.snapshot()), refresh=True)
-            time.sleep(every)
+            live.update(page(monitor.snapshot(), foot), refresh=True)
+            if MARK_KEY in pressed(every):
+                foot = f"{_mark(directory)}; {KEYS}"
+
+
+@contextmanager
+def _keys() -> Iterator[Callable[[float], str]]:
+    """Give a function that waits for keys for at most so many seconds and returns them; the terminal shows none."""
+
+    def wait(timeout_s: float) -> str:
+        time.sleep(timeout_s)
+        return ""
+
+    def pressed(timeout_s: float) -> str:
+        ready, _, _ = select.select([terminal], [], [], timeout_s)
+        if not ready:
+            return ""
+        return os.read(terminal, 64).decode("ascii", "ignore") or wait(timeout_s)  # a closed terminal is always ready
+
+    if not sys.stdin.isatty():
+        yield wait
+        return
+    terminal = sys.stdin.fileno()
+    before = termios.tcgetattr(terminal)
+    try:
+        tty.setcbreak(terminal)
+        yield pressed
+    finally:
+        termios.tcsetattr(terminal, termios.TCSADRAIN, before)
+
+
+def _mark(directory: Path) -> str:
+    """Ask the recorder to write a mark; return in words what came of it."""
+    from swath.daemon.log.words import clock_text
+    from swath.daemon.recorder.control_client import ask
+
+    try:
+        answer = ask(directory, {"command": "mark", "text": MARK_TEXT})
+    except UserError as error:
+        return one_line(f"no mark: {error}")
+    return f"marked at {clock_text(answer['time_ns'])}"
 
 
 def _once(monitor: Monitor, as_json: bool) -> str:
@@ -79,8 +130,8 @@ def _once(monitor: Monitor, as_json: bool) -> str:
     return str(found["verdict"])
 
 
-def page(found: dict[str, Any]) -> Group:
-    """Return the page for the terminal."""
+def page(found: dict[str, Any], foot: str = "") -> Group:
+    """Return the page for the terminal; ``foot`` is its last line."""
     from rich.console import Group, RenderableType
     from rich.table import Table
     from rich.text import Text
@@ -101,6 +152,8 @@ def page(found: dict[str, Any]) -> Group:
     parts.append(Text(f"\n{_disk(found)}\n"))
     for event in found["events"][-EVENTS_SHOWN:]:
         parts.append(_event(event))
+    if foot:
+        parts.append(Text(f"\n{one_line(foot)}", style="dim"))
     return Group(*parts)
 
 

@@ -11,6 +11,7 @@ import signal
 import socket
 import subprocess
 import sys
+import termios
 import threading
 import time
 import uuid
@@ -571,7 +572,7 @@ def _processor_s(pid: int) -> float:
 
 
 @pytest.mark.slow
-def test_on_a_terminal_a_page_is_shown_until_ctrl_c(tmp_path: Path, logs: Path) -> None:
+def test_on_a_terminal_a_page_is_shown_until_ctrl_c_and_a_key_marks(tmp_path: Path, logs: Path) -> None:
     port = free_udp_port()
     main, secondary = pty.openpty()
     environment = os.environ | {"TERM": "xterm", "COLUMNS": "100", "LINES": "30"}
@@ -579,22 +580,31 @@ def test_on_a_terminal_a_page_is_shown_until_ctrl_c(tmp_path: Path, logs: Path) 
         recorder.wait_said("device_opened")
         time.sleep(2.5)
         command = [sys.executable, "-m", "swath.daemon.cli.main", "monitor", str(logs)]
-        process = subprocess.Popen(command, cwd=ROOT, stdout=secondary, stderr=subprocess.PIPE, env=environment)
-        os.close(secondary)
+        process = subprocess.Popen(
+            command, cwd=ROOT, stdin=secondary, stdout=secondary, stderr=subprocess.PIPE, env=environment
+        )
+        before = termios.tcgetattr(main)
         wanted = (b"GB free", b"scanner/left", b"receiving", b"session_started", b"h left at the highest")
         shown = b""
         deadline_s = time.monotonic() + HANGS_S
         while not all(words in shown for words in wanted) and time.monotonic() < deadline_s:
             shown += os.read(main, 65536)  # a page comes in pieces
+        os.write(main, b"m")
+        while (
+            not all(words in shown for words in (b"marked at ", b"operator mark: ")) and time.monotonic() < deadline_s
+        ):
+            shown += os.read(main, 65536)
         process.send_signal(signal.SIGINT)
         with process:
             assert process.stderr is not None
             with process.stderr:
                 assert process.stderr.read() == b""
             assert process.wait(HANGS_S) == 130
+        assert termios.tcgetattr(main) == before
+        os.close(secondary)
         assert recorder.stop() == 0
     os.close(main)
-    for words in wanted:
+    for words in (*wanted, b"marked at ", b"operator mark: "):
         assert words in shown
 
 
