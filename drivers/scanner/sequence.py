@@ -1,21 +1,22 @@
-"""Follows a datagram counter (gaps, late and repeated datagrams, restarts) and thins out clock samples.
+"""Follows datagrams by a counter or by their stamps (gaps, late and repeated ones), and thins out clock samples.
 
-Both give the same result however the datagrams are cut into batches.
+All give the same result however the datagrams are cut into batches.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.georef.arrays import BoolArray, Int64Array
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 
 _U32 = 1 << 32
 LATE_DATAGRAMS = 64  # the network delays a datagram by at most so many places; a larger step back is a restart
 LATE_NS = 1_000_000_000
+LATE_PACKETS = 16  # the network delays a packet by at most so many places; a larger step back is a clock change
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,3 +170,65 @@ class SampleThinner:
             chosen[0] = bins[0] != self._last_bin
             self._last_bin = int(bins[-1])
         return chosen
+
+
+class StampTracker:
+    """Follows the stamps of packets and counts missing, late and repeated ones.
+
+    Counted in ``errors``: ``cadence_gap`` (packets missing), ``out_of_order`` (packets that came late, each counted as
+    missing before), ``duplicate``, ``stamp_jump`` (the clock was set: no gap).
+
+    The result is the same however the packets are cut into batches.
+
+    Args:
+        errors: the parser's ``counters.errors``.
+        wrap: value at which the stamps wrap, in the unit of all times here.
+        max_silence: a longer step means that the clock was set, not that packets were lost.
+    """
+
+    def __init__(self, errors: Counter[str], wrap: int, max_silence: int) -> None:
+        self._errors = errors
+        self._wrap = wrap
+        self._max_silence = max_silence
+        self._newest: int | None = None
+        self._recent: deque[int] = deque(maxlen=LATE_PACKETS + 1)
+
+    def follow(self, stamps: Int64Array, nominal: FloatArray) -> BoolArray:
+        """Take packets (n,) and the time that each spans; return (n,) False for a packet that has come before."""
+        if not len(stamps):
+            return np.zeros(0, dtype=np.bool_)
+        before = np.concatenate([[stamps[0] if self._newest is None else self._newest], stamps[:-1]])
+        step = (stamps - before) % self._wrap
+        if self._newest is None:
+            step[0] = round(nominal[0])
+        if not ((step > 0) & (step <= self._max_silence)).all():
+            pairs = zip(stamps.tolist(), nominal.tolist(), strict=True)
+            return np.array([self._step(stamp, nominal) for stamp, nominal in pairs], dtype=np.bool_)
+        self._count("cadence_gap", int(np.maximum(np.rint(step / nominal).astype(np.int64) - 1, 0).sum()))
+        self._newest = int(stamps[-1])
+        self._recent.extend(stamps[-LATE_PACKETS - 1 :].tolist())
+        return np.ones(len(stamps), dtype=np.bool_)
+
+    def _step(self, stamp: int, nominal: float) -> bool:
+        """Take one packet; return whether it is new."""
+        if stamp in self._recent:
+            self._errors["duplicate"] += 1
+            return False
+        newest = self._newest
+        self._recent.append(stamp)
+        if newest is not None:
+            step = (stamp - newest) % self._wrap
+            if self._wrap - step <= LATE_PACKETS * nominal:
+                self._errors["out_of_order"] += 1
+                return True
+            if step > self._max_silence:
+                self._errors["stamp_jump"] += 1
+                self._recent = deque([stamp], LATE_PACKETS + 1)
+            else:
+                self._count("cadence_gap", max(0, round(step / nominal) - 1))
+        self._newest = stamp
+        return True
+
+    def _count(self, code: str, count: int) -> None:
+        if count:
+            self._errors[code] += count

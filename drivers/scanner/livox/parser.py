@@ -46,8 +46,7 @@ from swath.drivers.scanner.livox.layout import (
 from swath.drivers.scanner.livox.layout import IMU_DTYPE as SENT_IMU_DTYPE
 from swath.drivers.scanner.livox.points import CONFIDENCE, CONFIDENCE_1, Pulses, fill_rows
 from swath.drivers.scanner.rows.slots import BLOCK_SLOTS
-from swath.drivers.scanner.sequence import SampleThinner
-from swath.drivers.scanner.velodyne.parser import StampTracker
+from swath.drivers.scanner.sequence import SampleThinner, StampTracker
 from swath.georef.arrays import BoolArray, Int64Array, StructArray
 from swath.georef.records import (
     AIMED_RETURN_DTYPE,
