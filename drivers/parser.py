@@ -11,15 +11,12 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from swath.georef.arrays import Int64Array
 from swath.georef.records import ByteRows, Chunk, ChunkBatch, Record
-
-if TYPE_CHECKING:
-    pass
 
 DeviceKind = Literal["gnss", "imu", "scanner", "corrections", "raw"]
 
@@ -50,6 +47,13 @@ class ParserCounters:
     bytes_skipped: int = 0
     errors: Counter[str] = field(default_factory=Counter)
     bytes_framed: int = 0
+
+    def count_bad(self, code: str, messages: int = 1, skipped: int = 0) -> None:
+        """Count messages that cannot be decoded under an error code, and ``skipped`` bytes of each."""
+        if messages:
+            self.bad_messages += messages
+            self.errors[code] += messages
+            self.bytes_skipped += messages * skipped
 
 
 class Parser(ABC):

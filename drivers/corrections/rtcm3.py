@@ -7,10 +7,11 @@ the log holds their bytes.
 from __future__ import annotations
 
 from swath.drivers.driver import STREAM_TRANSPORTS, Driver
-from swath.drivers.framing.framer import Frame, Framer
+from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import RTCM3
-from swath.drivers.parser import DeviceSettings, StreamParser
-from swath.georef.records import Chunk, DeviceStatus, Record
+from swath.drivers.framing.parser import FramedParser
+from swath.drivers.parser import DeviceSettings
+from swath.georef.records import DeviceStatus, Record
 
 HEADER_BYTES, CRC_BYTES = 3, 3
 STATION = {1005: 152, 1006: 168}  # bits of the stationary reference point's messages (3.5.2)
@@ -20,22 +21,14 @@ COORDINATE_M = 1e-4
 ID_AT, X_AT, Y_AT, Z_AT, HEIGHT_AT = 12, 34, 74, 114, 152
 
 
-class Rtcm3Parser(StreamParser):
+class Rtcm3Parser(FramedParser):
     """Parses one stream of corrections; bytes between its frames are skipped and counted."""
 
     def __init__(self, settings: DeviceSettings) -> None:
-        super().__init__()
-        self._framer = Framer((RTCM3,), self.counters)
+        super().__init__((RTCM3,))
 
-    def feed(self, chunk: Chunk) -> list[Record]:
+    def decode_frames(self, frames: list[Frame]) -> list[Record]:
         """Return a record for each message with the station's coordinates."""
-        return self._records(self._framer.feed(chunk.data, chunk.host_time_ns))
-
-    def close(self) -> list[Record]:
-        """Return the records that a false frame held back."""
-        return self._records(self._framer.close())
-
-    def _records(self, frames: list[Frame]) -> list[Record]:
         found = (self._station(frame.data[HEADER_BYTES:-CRC_BYTES], frame.host_time_ns) for frame in frames)
         return [record for record in found if record is not None]
 

@@ -25,17 +25,18 @@ import numpy as np
 
 from swath.drivers.driver import STREAM_TRANSPORTS, Driver
 from swath.drivers.framing.checksums import crc32_novatel
-from swath.drivers.framing.framer import Frame, Framer
+from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import NMEA, NOVATEL_ASCII, RTCM3, UNICORE, UNICORE_HEADER_BYTES
+from swath.drivers.framing.parser import FramedParser
 from swath.drivers.gnss.date_floor import WEEK_MS, ReceiverDates
 from swath.drivers.gnss.nmea.beside import NmeaFixes
 from swath.drivers.gnss.novatel import ascii as text
 from swath.drivers.gnss.novatel import layouts as nov
 from swath.drivers.gnss.novatel import tables
 from swath.drivers.gnss.novatel.records import Header, State, baseline_heading, position_fix, velocity_fix
-from swath.drivers.parser import DeviceSettings, ParserCounters, StreamParser
+from swath.drivers.parser import DeviceSettings, ParserCounters
 from swath.drivers.startup import PhraseListener, StartupMessage, StartupOptions, read_setup
-from swath.georef.records import Chunk, GnssFix, GnssHeading, NamesEdge, Record, TimeMessage
+from swath.georef.records import GnssFix, GnssHeading, NamesEdge, Record, TimeMessage
 
 # --- layouts ---
 
@@ -117,7 +118,7 @@ FRAME_KINDS = (replace(UNICORE, message_name=message_name), NOVATEL_ASCII, NMEA,
 # --- parser ---
 
 
-class UnicoreParser(StreamParser):
+class UnicoreParser(FramedParser):
     """Decodes the logs listed above; all others are framed and counted.
 
     Args:
@@ -126,27 +127,21 @@ class UnicoreParser(StreamParser):
     """
 
     def __init__(self, settings: DeviceSettings, *, wanted: tuple[type, ...] | None = None) -> None:
-        super().__init__()
-        self._framer = Framer(FRAME_KINDS, self.counters)
+        super().__init__(FRAME_KINDS, wanted)
         self._state = State(self.counters, ReceiverDates(settings))
-        self._wanted = wanted
         self._nmea = NmeaFixes(settings, self.counters) if wanted is None or GnssFix in wanted else None
         self._last_named: tuple[int, int] = (-1, -1)
 
-    def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one read; return the records that it completed."""
-        return self._decode(self._framer.feed(chunk.data, chunk.host_time_ns))
-
-    def close(self) -> list[Record]:
-        """Return the records held back."""
-        records = self._decode(self._framer.close())
-        return records + (list(self._nmea.close()) if self._nmea is not None else [])
+    def finish(self) -> list[Record]:
+        """Return the records of the last epoch."""
+        return list(self._nmea.close()) if self._nmea is not None else []
 
     def remarks(self) -> list[str]:
         """Return remarks on the receiver's weeks."""
         return self._state.dates.remarks()
 
-    def _decode(self, frames: list[Frame]) -> list[Record]:
+    def decode_frames(self, frames: list[Frame]) -> list[Record]:
+        """Decode consecutive frames; return their records in order."""
         records: list[Record] = []
         for frame in frames:
             if frame.kind == NMEA.name and self._nmea is not None:
@@ -157,11 +152,8 @@ class UnicoreParser(StreamParser):
                 try:
                     records += self._log(frame)
                 except text.FieldError as error:
-                    self.counters.bad_messages += 1
-                    self.counters.errors["bad_length" if str(error) == "length" else "bad_field"] += 1
-        if self._wanted is None:
-            return records
-        return [record for record in records if type(record) in self._wanted]
+                    self.counters.count_bad("bad_length" if str(error) == "length" else "bad_field")
+        return records
 
     def _log(self, frame: Frame) -> list[Record]:
         binary = frame.kind == UNICORE.name

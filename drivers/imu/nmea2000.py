@@ -147,7 +147,7 @@ class Nmea2000Parser(PacketParser):
         self.counters.bytes += units.size
         table = decode_can_frames(units)
         if table is None:
-            self._count_bad(len(units))
+            self.counters.count_bad("bad_length", len(units))
             return []
         pgn, source = self._addresses(table["can_id"])
         found: list[tuple[int, list[Record]]] = []
@@ -178,10 +178,6 @@ class Nmea2000Parser(PacketParser):
         pgn, source = pgn_and_source(can_id)
         return np.where((can_id & np.uint32(CAN_EFF_FLAG) != 0) & (flagged == 0), pgn, -1), source
 
-    def _count_bad(self, messages: int, code: str = "bad_length") -> None:
-        self.counters.bad_messages += messages
-        self.counters.errors[code] += messages
-
     def _source_of(self, pgn: int, first: int) -> int:
         """Return the source used for a PGN; ``first`` is the source of its first message."""
         return self._wanted if self._wanted is not None else self._used.setdefault(pgn, first)
@@ -198,7 +194,7 @@ class Nmea2000Parser(PacketParser):
         """Return row and records of each frame of a single-frame PGN."""
         whole = where[table["length"][where] >= layout.needs_bytes]
         if len(whole) < len(where):
-            self._count_bad(len(where) - len(whole))
+            self.counters.count_bad("bad_length", len(where) - len(whole))
         if not len(whole):
             return []
         self.counters.messages[str(pgn)] += len(whole)
@@ -226,7 +222,7 @@ class Nmea2000Parser(PacketParser):
             if message is None:
                 continue
             if len(message) < GNSS_STRUCT.size:
-                self._count_bad(1)
+                self.counters.count_bad("bad_length")
                 continue
             self.counters.messages[str(GNSS_POSITION)] += 1
             if sender != self._source_of(GNSS_POSITION, sender):
@@ -241,7 +237,7 @@ class Nmea2000Parser(PacketParser):
         if self._packets.incomplete:
             self.counters.errors["fast_packet_incomplete"] += self._packets.incomplete
         if self._packets.bad_length:
-            self._count_bad(self._packets.bad_length)
+            self.counters.count_bad("bad_length", self._packets.bad_length)
         self._packets.incomplete = self._packets.bad_length = 0
 
     # -- records
@@ -259,7 +255,7 @@ class Nmea2000Parser(PacketParser):
     def _tag(self, days: int, time: int) -> TimeTag | None:
         """Return UTC of a date and time of day; where they are invalid, count them and return None."""
         if time > DAY_UNITS:
-            self._count_bad(1, "bad_value")
+            self.counters.count_bad("bad_value")
             return None
         return TimeTag(TimeScale.UTC, time * TIME_UNIT_NS, date=UNIX_EPOCH + dt.timedelta(days=days))
 
@@ -298,7 +294,7 @@ class Nmea2000Parser(PacketParser):
         lat_deg, lon_deg = lat * 1e-16, lon * 1e-16
         has_position = is_available(lat, 63) and is_available(lon, 63)
         if has_position and (abs(lat_deg) > 90.0 or abs(lon_deg) > 180.0):
-            self._count_bad(1, "bad_value")
+            self.counters.count_bad("bad_value")
             return records
         fix_type = METHODS.get(method, FixType.NONE) if has_position else FixType.NONE
         fix = GnssFix(

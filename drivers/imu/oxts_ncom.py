@@ -20,13 +20,12 @@ from math import isfinite, nan
 from typing import TypeAlias
 
 from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside
-from swath.drivers.framing.framer import Frame, FrameKind, Framer
-from swath.drivers.gnss.record_rows import Row, join_rows
+from swath.drivers.framing.framer import Frame, FrameKind
+from swath.drivers.framing.parser import FramedParser
 from swath.drivers.imu.unit_time import WEEK_NS, Moment, UnitTime
-from swath.drivers.parser import DeviceSettings, StreamParser
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.record_rows import Row
 from swath.georef.records import (
-    Chunk,
-    ChunkBatch,
     DeviceStatus,
     EventMark,
     ImuSamples,
@@ -160,7 +159,7 @@ class _Latest:
     state: tuple[int, ...] = ()
 
 
-class NcomParser(StreamParser):
+class NcomParser(FramedParser):
     """Decodes NCOM packets of the public structure; the maker's internal ones are framed and counted.
 
     Args:
@@ -169,36 +168,18 @@ class NcomParser(StreamParser):
     """
 
     def __init__(self, settings: DeviceSettings, *, wanted: tuple[type, ...] | None = None) -> None:
-        super().__init__()
-        self._framer = Framer((NCOM,), self.counters)
-        self._wanted = wanted
+        super().__init__((NCOM,), wanted)
         self._ellipsoidal = settings.config.get("altitude") == "ellipsoid"
         self._time = UnitTime(settings, self.counters, "NCOM")
         self._latest = _Latest()
 
-    def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one read; return the records that it completed."""
-        return self._decode_all(self._framer.feed(chunk.data, chunk.host_time_ns))
-
-    def feed_batch(self, batch: ChunkBatch) -> list[Record]:
-        """Take consecutive reads; return neighbouring samples of all of them as one array."""
-        frames: list[Frame] = []
-        for host_time_ns, unit in zip(batch.host_time_ns.tolist(), batch.units, strict=True):
-            frames += self._framer.feed(unit.tobytes(), host_time_ns)
-        return self._decode_all(frames)
-
-    def close(self) -> list[Record]:
-        """Return the records held back."""
-        return self._decode_all(self._framer.close())
-
-    def _decode_all(self, frames: list[Frame]) -> list[Record]:
+    def decode_frames(self, frames: list[Frame]) -> Items:
+        """Decode consecutive frames; return their records, or rows of them, in order."""
         items: Items = []
         for _, host_time_ns, packet in frames:
             if packet[STATUS_AT] in PUBLIC:
                 items += self._decode(host_time_ns, packet)
-        if self._wanted is not None:
-            items = [item for item in items if (item.record if isinstance(item, Row) else type(item)) in self._wanted]
-        return join_rows(items)
+        return items
 
     def _decode(self, host_time_ns: int, packet: bytes) -> Items:
         status = packet[STATUS_AT]

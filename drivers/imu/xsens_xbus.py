@@ -23,14 +23,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from swath.drivers.driver import STREAM_TRANSPORTS, Driver
-from swath.drivers.framing.framer import Frame, Framer
+from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import XBUS, XBUS_EXTENDED, XBUS_MTDATA2
+from swath.drivers.framing.parser import FramedParser
 from swath.drivers.imu.counters import CounterUnwrapper, GapCounter, nanoseconds
-from swath.drivers.parser import DeviceSettings, DriverSettingsError, StreamParser
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.georef.records import (
     IMU_DTYPE,
-    Chunk,
-    ChunkBatch,
     ImuSamples,
     NamesEdge,
     Record,
@@ -200,7 +199,7 @@ def read_items(data: bytes) -> dict[int, tuple[Any, ...]] | None:
     return values
 
 
-class XbusParser(StreamParser):
+class XbusParser(FramedParser):
     """Converts MTData2 to `ImuSamples` and, once a second, to `TimeMessage`."""
 
     def __init__(self, settings: DeviceSettings, *, time_only: bool = False) -> None:
@@ -213,8 +212,7 @@ class XbusParser(StreamParser):
         Raises:
             DriverSettingsError: increments are configured without a rate to divide them by.
         """
-        super().__init__()
-        self._framer = Framer((XBUS,), self.counters)
+        super().__init__((XBUS,))
         self._increments = settings.config.get("sample") == "increment"
         self._rate_hz = float(settings.config.get("rate_hz") or 0.0)
         if self._increments and self._rate_hz <= 0.0:
@@ -224,22 +222,7 @@ class XbusParser(StreamParser):
         self._unwrapper = CounterUnwrapper(TICK_BITS, TICK_HZ)
         self._last_second: tuple[Any, ...] | None = None
 
-    def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one read; return the records that it completed."""
-        return self._decode_all(self._framer.feed(chunk.data, chunk.host_time_ns))
-
-    def feed_batch(self, batch: ChunkBatch) -> list[Record]:
-        """Take consecutive reads; return all their samples as one array."""
-        frames: list[Frame] = []
-        for host_time_ns, unit in zip(batch.host_time_ns.tolist(), batch.units, strict=True):
-            frames += self._framer.feed(unit.tobytes(), host_time_ns)
-        return self._decode_all(frames)
-
-    def close(self) -> list[Record]:
-        """Return the records held back."""
-        return self._decode_all(self._framer.close())
-
-    def _decode_all(self, frames: list[Frame]) -> list[Record]:
+    def decode_frames(self, frames: list[Frame]) -> list[Record]:
         """Return time messages in order, then the samples of all frames."""
         records: list[Record] = []
         samples: list[Sample] = []
@@ -249,7 +232,7 @@ class XbusParser(StreamParser):
                 continue
             items = read_items(frame.data[6 if frame.data[3] == XBUS_EXTENDED else 4 : -1])
             if items is None:
-                self._count_bad("bad_length")
+                self.counters.count_bad("bad_length")
                 continue
             packets += items.get(PACKET_COUNTER, ())
             records += self._time_message(frame.host_time_ns, items)
@@ -259,10 +242,6 @@ class XbusParser(StreamParser):
         if missing:
             self.counters.errors["packet_gap"] += missing
         return [*records, self._rows(samples)] if samples else records
-
-    def _count_bad(self, code: str) -> None:
-        self.counters.bad_messages += 1
-        self.counters.errors[code] += 1
 
     def _time_message(self, host_time_ns: int, items: Mapping[int, Any]) -> list[TimeMessage]:
         """Return a message with the UTC of the first sample of each second; its edge is the one before its arrival."""
@@ -302,7 +281,7 @@ class XbusParser(StreamParser):
             force = tuple(part * self._rate_hz for part in force)
             rate = tuple(part * self._rate_hz for part in rotation_vector(rate))
         if not all(map(isfinite, (*force, *rate))):
-            self._count_bad("bad_value")
+            self.counters.count_bad("bad_value")
             return []
         (ticks,) = items.get(SAMPLE_TIME_FINE, (-1,))
         (celsius,) = items.get(TEMPERATURE, (nan,))

@@ -197,8 +197,7 @@ class Pages:
         """Take a packet; return a report's records once it is complete."""
         payload = frame[GENOUT_DATA_START:-2]
         if len(payload) < PAGE_HEADER.size:
-            self._counters.bad_messages += 1
-            self._counters.errors["bad_length"] += 1
+            self._counters.count_bad("bad_length")
             return None
         transmission, page, last = PAGE_HEADER.unpack_from(payload)
         if page == 0:
@@ -229,8 +228,7 @@ def split_records(report: bytes, counters: ParserCounters) -> list[tuple[int, by
     while at + 2 <= len(report):
         number, length = report[at], report[at + 1]
         if at + 2 + length > len(report):
-            counters.bad_messages += 1
-            counters.errors["bad_length"] += 1
+            counters.count_bad("bad_length")
             break
         records.append((number, report[at + 2 : at + 2 + length]))
         at += 2 + length

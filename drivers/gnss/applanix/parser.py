@@ -17,6 +17,7 @@ Rows without alignment (GSOF below "aligned", POS beyond "fine alignment") are c
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import cos, isfinite, nan, radians, sin
@@ -25,15 +26,15 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from swath.drivers.driver import STREAM_TRANSPORTS, Driver
-from swath.drivers.framing.framer import Frame, Framer
+from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import GENOUT, NMEA, POS, pos_name
+from swath.drivers.framing.parser import FramedParser
 from swath.drivers.gnss.applanix import groups as pos
 from swath.drivers.gnss.applanix import gsof
 from swath.drivers.gnss.date_floor import WEEK_MS, ReceiverDates
-from swath.drivers.gnss.record_rows import Row, join_rows
-from swath.drivers.parser import DeviceSettings, StreamParser
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.record_rows import Row
 from swath.georef.records import (
-    Chunk,
     DeviceStatus,
     EventMark,
     FixType,
@@ -104,41 +105,25 @@ def navigation_row(
     return Row(InsSolution, values)
 
 
-class _Parser(StreamParser):
+class _Parser(FramedParser):
     """Holds what both protocols share: framing, weeks, and the filter of record types."""
 
     def __init__(self, settings: DeviceSettings, wanted: tuple[type, ...] | None, kinds: tuple[Any, ...]) -> None:
-        super().__init__()
-        self._framer = Framer(kinds, self.counters)
+        super().__init__(kinds, wanted)
         self._dates = ReceiverDates(settings)
-        self._wanted = wanted
         self._sigmas: Sigmas | None = None
-
-    def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one read; return the records that it completed."""
-        return self._decode_all(self._framer.feed(chunk.data, chunk.host_time_ns))
-
-    def close(self) -> list[Record]:
-        """Return the records of the tail."""
-        return self._decode_all(self._framer.close())
 
     def remarks(self) -> list[str]:
         """Return remarks on the receiver's weeks."""
         return self._dates.remarks()
 
-    def _decode_all(self, frames: list[Frame]) -> list[Record]:
-        items: Items = [item for frame in frames for item in self._decode(frame)]
-        if self._wanted is not None:
-            items = [item for item in items if (item.record if isinstance(item, Row) else type(item)) in self._wanted]
-        return join_rows(items)
+    def decode_frames(self, frames: list[Frame]) -> Items:
+        """Decode consecutive frames; return their records, or rows of them, in order."""
+        return [item for frame in frames for item in self._decode(frame)]
 
+    @abstractmethod
     def _decode(self, frame: Frame) -> Items:
-        raise NotImplementedError
-
-    def _bad(self, code: str) -> Items:
-        self.counters.bad_messages += 1
-        self.counters.errors[code] += 1
-        return []
+        """Decode one frame."""
 
     def _week(self, week: int, host_time_ns: int) -> int | None:
         """Return a week after the move by roll-overs; None, counted, before the floor."""
@@ -181,10 +166,10 @@ class GsofParser(_Parser):
                 continue
             message = layout.decode(records[layout.number])
             if message is None or getattr(message, "milliseconds", 0) >= WEEK_MS:
-                self._bad("bad_length" if message is None else "bad_time")
+                self.counters.count_bad("bad_length" if message is None else "bad_time")
                 continue
             if not all(map(isfinite, message)):
-                self._bad("not_finite")
+                self.counters.count_bad("not_finite")
                 continue
             found[layout.number] = message
         items: Items = []
@@ -361,7 +346,8 @@ class PosParser(_Parser):
     def _navigation(self, host_time_ns: int, data: bytes) -> Items:
         found = pos.NAVIGATION.decode(data)
         if found is None or not all(map(isfinite, (*found[0], *found[1]))):
-            return self._bad("bad_length" if found is None else "not_finite")
+            self.counters.count_bad("bad_length" if found is None else "not_finite")
+            return []
         times, navigation = found
         if navigation.alignment not in (pos.FULL_NAVIGATION, pos.FINE_ALIGNMENT):
             self.counters.errors["ins_not_aligned"] += 1
@@ -377,7 +363,8 @@ class PosParser(_Parser):
     def _performance(self, host_time_ns: int, data: bytes) -> Items:
         found = pos.PERFORMANCE.decode(data)
         if found is None or not all(map(isfinite, (*found[0], *found[1]))):
-            return self._bad("bad_length" if found is None else "not_finite")
+            self.counters.count_bad("bad_length" if found is None else "not_finite")
+            return []
         tag = self._tag(found[0])
         if tag is not None:
             self._sigmas = sigmas_of(tag.time_ns, found[1])
@@ -387,7 +374,8 @@ class PosParser(_Parser):
         """Note week and leap seconds; return the status."""
         found = pos.decode_gnss_status(data)
         if found is None or not all(map(isfinite, (*found[0], *found[2]))):
-            return self._bad("bad_length" if found is None else "not_finite")
+            self.counters.count_bad("bad_length" if found is None else "not_finite")
+            return []
         times, solution, status = found
         week = self._week(status.week, host_time_ns) if 0 < status.week <= 0xFFFF else None
         leap = round(status.leap_seconds) if abs(status.leap_seconds) < 100 else None
@@ -405,7 +393,8 @@ class PosParser(_Parser):
         layout = pos.EVENT_1 if pos_name(data) == "GRP5" else pos.EVENT_2
         found = layout.decode(data)
         if found is None or not all(map(isfinite, found[0])):
-            return self._bad("bad_length" if found is None else "not_finite")
+            self.counters.count_bad("bad_length" if found is None else "not_finite")
+            return []
         tag = self._tag(found[0])
         if tag is None:
             return []
@@ -418,7 +407,8 @@ class PosParser(_Parser):
         """Return the second of a pulse; group 7 is sent after each pulse, with its time."""
         found = pos.PPS.decode(data)
         if found is None or not all(map(isfinite, found[0])):
-            return self._bad("bad_length" if found is None else "not_finite")
+            self.counters.count_bad("bad_length" if found is None else "not_finite")
+            return []
         tag = self._tag(found[0])
         if tag is None:
             return []
@@ -430,7 +420,8 @@ class PosParser(_Parser):
     def _general(self, host_time_ns: int, data: bytes) -> Items:
         found = pos.GENERAL.decode(data)
         if found is None:
-            return self._bad("bad_length")
+            self.counters.count_bad("bad_length")
+            return []
         return [DeviceStatus(host_time_ns, dict(found[1]._asdict()), message="GRP10")]
 
 

@@ -30,15 +30,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from swath.drivers.driver import STREAM_TRANSPORTS, Driver
-from swath.drivers.framing.framer import Frame, Framer
+from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import GNSS_KINDS
+from swath.drivers.framing.parser import FramedParser
 from swath.drivers.gnss.date_floor import ReceiverDates
 from swath.drivers.gnss.epochs import EpochGatherer
 from swath.drivers.gnss.nmea.sentences import MPS_PER_KMPH, MPS_PER_KNOT, FieldError, Sentence, velocity_from_course
-from swath.drivers.parser import DeviceSettings, ParserCounters, StreamParser
+from swath.drivers.parser import DeviceSettings, ParserCounters
 from swath.georef.arrays import FloatArray
 from swath.georef.records import (
-    Chunk,
     FixType,
     GnssFix,
     GnssHeading,
@@ -353,7 +353,7 @@ def merge_epoch(parts: dict[str, Part]) -> GnssFix | None:
     )
 
 
-class NmeaParser(StreamParser):
+class NmeaParser(FramedParser):
     """Converts sentences to records; UBX and RTCM3 on the same port are framed and counted.
 
     Args:
@@ -362,17 +362,16 @@ class NmeaParser(StreamParser):
     """
 
     def __init__(self, settings: DeviceSettings, *, time_only: bool = False) -> None:
-        super().__init__()
-        self._framer = Framer(GNSS_KINDS, self.counters)
+        super().__init__(GNSS_KINDS)
         self._decoder = NmeaDecoder(settings, self.counters, time_only=time_only)
 
-    def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one read; return the records that it completed."""
-        return self._decoder.decode(self._framer.feed(chunk.data, chunk.host_time_ns))
+    def decode_frames(self, frames: list[Frame]) -> list[Record]:
+        """Decode consecutive frames; return their records in order."""
+        return self._decoder.decode(frames)
 
-    def close(self) -> list[Record]:
-        """Return the records of the tail and of the last epoch."""
-        return self._decoder.decode(self._framer.close()) + self._decoder.close()
+    def finish(self) -> list[Record]:
+        """Return the records of the last epoch."""
+        return self._decoder.close()
 
     def remarks(self) -> list[str]:
         """Return remarks on the receiver's dates."""

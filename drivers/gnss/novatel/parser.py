@@ -21,18 +21,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 from swath.drivers.driver import STREAM_TRANSPORTS, Driver
-from swath.drivers.framing.framer import Frame, Framer
+from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import NMEA, NOVATEL, NOVATEL_ASCII, NOVATEL_SHORT, RTCM3
+from swath.drivers.framing.parser import FramedParser
 from swath.drivers.gnss.date_floor import ReceiverDates
 from swath.drivers.gnss.novatel import ascii as text
 from swath.drivers.gnss.novatel import layouts as nov
 from swath.drivers.gnss.novatel import tables
 from swath.drivers.gnss.novatel.records import DECODERS, Header, State
 from swath.drivers.gnss.novatel.startup import startup_messages
-from swath.drivers.gnss.record_rows import Row, join_rows
-from swath.drivers.parser import DeviceSettings, DriverSettingsError, StreamParser
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.record_rows import Row
 from swath.georef.records import (
-    Chunk,
     DeviceStatus,
     EventMark,
     GnssFix,
@@ -87,7 +87,7 @@ FRAME_KINDS = (
 )
 
 
-class NovatelParser(StreamParser):
+class NovatelParser(FramedParser):
     """Decodes the logs listed above; all others are framed and counted."""
 
     def __init__(self, settings: DeviceSettings, *, wanted: tuple[type, ...] | None = None) -> None:
@@ -100,29 +100,20 @@ class NovatelParser(StreamParser):
         Raises:
             DriverSettingsError: the IMU type is not in the table, or ``date_floor`` or ``add_weeks`` is invalid.
         """
-        super().__init__()
-        self._framer = Framer(FRAME_KINDS, self.counters)
-        self._wanted = wanted
+        super().__init__(FRAME_KINDS, wanted)
         self._bodies = {body for body, gives in GIVES.items() if wanted is None or not set(wanted).isdisjoint(gives)}
         self._state = State(self.counters, ReceiverDates(settings), imu_scale(settings))
         self._last_named: tuple[int, int] = (-1, -1)
         self._has_solutions = False  # solutions give the second, so raw measurements, which come later, are not used
 
-    def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one read; return the records that it completed."""
-        return self._decode_all(self._framer.feed(chunk.data, chunk.host_time_ns))
-
-    def close(self) -> list[Record]:
-        """Return the records held back."""
-        return self._decode_all(self._framer.close())
-
     def remarks(self) -> list[str]:
         """Return remarks on the receiver's weeks."""
         return self._state.dates.remarks()
 
-    def _decode_all(self, frames: list[Frame]) -> list[Record]:
+    def decode_frames(self, frames: list[Frame]) -> list[Record | Row]:
+        """Decode consecutive frames; return their records, or rows of them, in order."""
         logs = (frame for frame in frames if frame.kind.startswith("novatel"))
-        return join_rows(item for log in logs for item in self._decode(log))
+        return [item for log in logs for item in self._decode(log)]
 
     def _decode(self, frame: Frame) -> list[Record | Row]:
         """Decode one frame; a body that is too short or cannot be read is counted."""
@@ -138,8 +129,7 @@ class NovatelParser(StreamParser):
         if header is None:
             return []
         if len(body) < layout.wire.size:
-            self.counters.bad_messages += 1
-            self.counters.errors["bad_length"] += 1
+            self.counters.count_bad("bad_length")
             return []
         return self._records(header, layout.body._make(layout.wire.unpack_from(body)))
 
@@ -161,15 +151,11 @@ class NovatelParser(StreamParser):
                 return self._second_of_raw(header)
             return self._records(header, text.read_body(layout.body, layout.wire, texts))
         except text.FieldError:
-            self.counters.bad_messages += 1
-            self.counters.errors["bad_field"] += 1
+            self.counters.count_bad("bad_field")
             return []
 
     def _records(self, header: Header, message: nov.Body) -> list[Record | Row]:
-        items = [*self._named_second(header), *DECODERS[type(message)](self._state, header, message)]
-        if self._wanted is None:
-            return items
-        return [item for item in items if (item.record if isinstance(item, Row) else type(item)) in self._wanted]
+        return [*self._named_second(header), *DECODERS[type(message)](self._state, header, message)]
 
     def _named_second(self, header: Header) -> list[TimeMessage]:
         """Return the whole second of a synchronous solution, once for all logs of an epoch."""

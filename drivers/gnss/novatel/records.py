@@ -13,8 +13,8 @@ import numpy as np
 from swath.drivers.gnss.date_floor import ReceiverDates, leap_seconds_of
 from swath.drivers.gnss.novatel import layouts as nov
 from swath.drivers.gnss.novatel import tables
-from swath.drivers.gnss.record_rows import Row
 from swath.drivers.parser import ParserCounters
+from swath.drivers.record_rows import Row
 from swath.georef.records import (
     DeviceStatus,
     EventMark,

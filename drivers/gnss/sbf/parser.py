@@ -21,19 +21,19 @@ from dataclasses import replace
 from typing import TypeAlias
 
 from swath.drivers.driver import STREAM_TRANSPORTS, Driver
-from swath.drivers.framing.framer import Frame, Framer
+from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import NMEA, RTCM3, SBF
+from swath.drivers.framing.parser import FramedParser
 from swath.drivers.gnss.date_floor import ReceiverDates, leap_seconds_of
 from swath.drivers.gnss.epochs import EpochGatherer
-from swath.drivers.gnss.record_rows import Row, join_rows
 from swath.drivers.gnss.sbf import blocks as sbf
 from swath.drivers.gnss.sbf import frame as wire
 from swath.drivers.gnss.sbf import records
 from swath.drivers.gnss.sbf.records import FixPart, HeadingPart, ImuPairs, ReceiverClock, Stamp
 from swath.drivers.gnss.sbf.startup import startup_messages
-from swath.drivers.parser import DeviceSettings, StreamParser
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.record_rows import Row
 from swath.georef.records import (
-    Chunk,
     EventMark,
     GnssFix,
     GnssHeading,
@@ -73,7 +73,7 @@ GIVES: dict[int, tuple[type, ...]] = {  # record types to which a block contribu
 }
 
 
-class SbfParser(StreamParser):
+class SbfParser(FramedParser):
     """Decodes the blocks listed above; all others are framed and counted.
 
     Args:
@@ -82,10 +82,8 @@ class SbfParser(StreamParser):
     """
 
     def __init__(self, settings: DeviceSettings, *, wanted: tuple[type, ...] | None = None) -> None:
-        super().__init__()
-        self._framer = Framer(FRAME_KINDS, self.counters)
+        super().__init__(FRAME_KINDS, wanted)
         self._dates = ReceiverDates(settings)
-        self._wanted = wanted
         self._gathers_fixes = wanted is None or GnssFix in wanted
         self._clock = ReceiverClock(self.counters)
         self._imu = ImuPairs(self.counters)
@@ -116,25 +114,16 @@ class SbfParser(StreamParser):
             if wanted is None or not set(wanted).isdisjoint(GIVES[number])
         }
 
-    def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one read; return the records that it completed."""
-        return self._join(self._decode(self._framer.feed(chunk.data, chunk.host_time_ns)))
-
-    def close(self) -> list[Record]:
-        """Return the records of the tail and of the last epochs."""
-        items = self._decode(self._framer.close())
-        return self._join(items + self._give_fixes(self._fixes.end()) + self._give_headings(self._headings.end()))
+    def finish(self) -> Items:
+        """Return the records of the last epochs."""
+        return self._give_fixes(self._fixes.end()) + self._give_headings(self._headings.end())
 
     def remarks(self) -> list[str]:
         """Return remarks on the receiver's weeks."""
         return self._dates.remarks()
 
-    def _join(self, items: Items) -> list[Record]:
-        if self._wanted is not None:
-            items = [item for item in items if (item.record if isinstance(item, Row) else type(item)) in self._wanted]
-        return join_rows(items)
-
-    def _decode(self, frames: list[Frame]) -> Items:
+    def decode_frames(self, frames: list[Frame]) -> Items:
+        """Decode consecutive frames; return their records, or rows of them, in order."""
         items: Items = []
         for kind, host_time_ns, data in frames:
             decode = self._decoders.get(wire.number_of(data)) if kind == SBF.name else None
@@ -143,8 +132,7 @@ class SbfParser(StreamParser):
             try:
                 items += decode(self._stamp(host_time_ns, data), data)
             except wire.BlockError as error:
-                self.counters.bad_messages += 1
-                self.counters.errors[str(error)] += 1
+                self.counters.count_bad(str(error))
         return items
 
     def _stamp(self, host_time_ns: int, frame: bytes) -> Stamp:

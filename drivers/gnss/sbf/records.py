@@ -13,9 +13,9 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from swath.drivers.gnss.record_rows import Row
 from swath.drivers.gnss.sbf import blocks as sbf
 from swath.drivers.parser import ParserCounters
+from swath.drivers.record_rows import Row
 from swath.georef.arrays import FloatArray
 from swath.georef.records import (
     EventMark,

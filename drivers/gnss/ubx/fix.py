@@ -14,9 +14,9 @@ from typing import NamedTuple, TypeAlias, TypeVar
 import numpy as np
 
 from swath.drivers.gnss.date_floor import GPS_EPOCH
-from swath.drivers.gnss.record_rows import Row
 from swath.drivers.gnss.ubx import messages as ubx
 from swath.drivers.parser import ParserCounters
+from swath.drivers.record_rows import Row
 from swath.georef.arrays import FloatArray
 from swath.georef.records import FixType, GnssFix, GnssHeading, InsSolution, TimeScale, TimeTag
 

@@ -31,12 +31,12 @@ from collections.abc import Callable
 from typing import Any, Protocol, TypeAlias, TypeVar
 
 from swath.drivers.driver import STREAM_TRANSPORTS, Driver
-from swath.drivers.framing.framer import Frame, Framer
+from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import GNSS_KINDS
+from swath.drivers.framing.parser import FramedParser
 from swath.drivers.gnss.date_floor import GPS_EPOCH, ReceiverDates, leap_seconds_of
 from swath.drivers.gnss.epochs import EpochGatherer
 from swath.drivers.gnss.nmea.beside import NmeaFixes
-from swath.drivers.gnss.record_rows import Row, join_rows
 from swath.drivers.gnss.ubx import messages as ubx
 from swath.drivers.gnss.ubx.fix import (
     POSITION_MESSAGES,
@@ -48,9 +48,9 @@ from swath.drivers.gnss.ubx.fix import (
 )
 from swath.drivers.gnss.ubx.sensors import MEAS_KEY, RAW_KEY, SensorSamples, vehicle_motion
 from swath.drivers.gnss.ubx.startup import startup_messages
-from swath.drivers.parser import DeviceSettings, StreamParser
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.record_rows import Row
 from swath.georef.records import (
-    Chunk,
     DeviceStatus,
     EventMark,
     GnssFix,
@@ -118,7 +118,7 @@ NAV_PARTS: dict[bytes, tuple[str, ubx.Layout[Any]]] = {  # messages that contrib
 }
 
 
-class UbxParser(StreamParser):
+class UbxParser(FramedParser):
     """Converts UBX frames to records.
 
     Args:
@@ -131,11 +131,9 @@ class UbxParser(StreamParser):
     """
 
     def __init__(self, settings: DeviceSettings, *, wanted: tuple[type, ...] | None = None) -> None:
-        super().__init__()
+        super().__init__(GNSS_KINDS, wanted)
         self._dates = ReceiverDates(settings)
-        self._framer = Framer(GNSS_KINDS, self.counters)
         self._epochs: EpochGatherer[tuple[int, NavMessage]] = EpochGatherer(self.counters)
-        self._wanted = wanted
         self._gathers = wanted is None or not set(wanted).isdisjoint(_EPOCH)
         self._nmea = NmeaFixes(settings, self.counters) if wanted is None or GnssFix in wanted else None
         self._sensors = SensorSamples(settings, self.counters)
@@ -167,25 +165,17 @@ class UbxParser(StreamParser):
             key: decode for key, decode in decoders.items() if wanted is None or not set(wanted).isdisjoint(GIVES[key])
         }
 
-    def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one read; return the records that it completed."""
-        return self._join(self._decode(self._framer.feed(chunk.data, chunk.host_time_ns)))
-
-    def close(self) -> list[Record]:
-        """Return the records of the tail and of the last epoch."""
-        items = self._decode(self._framer.close()) + self._merged(self._epochs.end())
-        return self._join(items + (list(self._nmea.close()) if self._nmea is not None else []))
+    def finish(self) -> Items:
+        """Return the records of the last epoch."""
+        items = self._merged(self._epochs.end())
+        return items + (list(self._nmea.close()) if self._nmea is not None else [])
 
     def remarks(self) -> list[str]:
         """Return remarks on the receiver's dates."""
         return self._dates.remarks()
 
-    def _join(self, items: Items) -> list[Record]:
-        if self._wanted is not None:
-            items = [item for item in items if (item.record if isinstance(item, Row) else type(item)) in self._wanted]
-        return join_rows(items)
-
-    def _decode(self, frames: list[Frame]) -> Items:
+    def decode_frames(self, frames: list[Frame]) -> Items:
+        """Decode consecutive frames; return their records, or rows of them, in order."""
         items: Items = []
         for frame in frames:
             if frame.kind == "nmea" and self._nmea is not None:

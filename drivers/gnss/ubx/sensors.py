@@ -16,10 +16,10 @@ from math import nan, radians
 
 import numpy as np
 
-from swath.drivers.gnss.record_rows import Row
 from swath.drivers.gnss.ubx.messages import ESF_INS, ESF_INS_FIRST_VALID_BIT, EsfIns, encode_frame
 from swath.drivers.imu.counters import CounterUnwrapper
 from swath.drivers.parser import DeviceSettings, DriverSettingsError, ParserCounters
+from swath.drivers.record_rows import Row
 from swath.georef.records import DeviceStatus, ImuSamples
 from swath.georef.timescales.gps_time import SECOND_NS
 

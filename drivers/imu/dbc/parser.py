@@ -158,7 +158,7 @@ class DbcParser(PacketParser):
         """Return the data frames of configured parts; other identifiers belong to other devices."""
         table = decode_can_frames(units)
         if table is None:
-            self._count_bad(len(units))
+            self.counters.count_bad("bad_length", len(units))
             return no_frames(self._width)
         can_id = table["can_id"]
         self._count_flagged(can_id)
@@ -187,7 +187,7 @@ class DbcParser(PacketParser):
             where = where[np.isin(value, np.array(sorted(kind.selector_values), dtype=np.uint64))]
         whole = table["length"][where] >= kind.needs_bytes
         if not whole.all():
-            self._count_bad(int(np.count_nonzero(~whole)))
+            self.counters.count_bad("bad_length", int(np.count_nonzero(~whole)))
             where = where[whole]
         if len(where):
             self.counters.messages[kind.message] += len(where)
@@ -207,10 +207,6 @@ class DbcParser(PacketParser):
         if named:
             joined = {address: np.concatenate(found) for address, found in named.items()}
             self._choice.settle(joined, can_id & np.uint32(0xFF))
-
-    def _count_bad(self, frames: int) -> None:
-        self.counters.bad_messages += frames
-        self.counters.errors["bad_length"] += frames
 
     def _count_gaps(self, frames: Frames) -> None:
         """Count the frames that the device's own counter shows to be missing."""

@@ -21,16 +21,15 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside
-from swath.drivers.framing.framer import Frame, Framer
+from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import NMEA
-from swath.drivers.gnss.record_rows import Row, join_rows
+from swath.drivers.framing.parser import FramedParser
 from swath.drivers.imu.microstrain.startup import receiver_startup_messages, startup_messages
 from swath.drivers.imu.microstrain.wire import FILTER, MIP, RECEIVERS, SENSOR, read_values
 from swath.drivers.imu.unit_time import WEEK_NS, Moment, UnitTime
-from swath.drivers.parser import DeviceSettings, StreamParser
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.record_rows import Row
 from swath.georef.records import (
-    Chunk,
-    ChunkBatch,
     DeviceStatus,
     EventMark,
     FixType,
@@ -70,7 +69,7 @@ class _Latest:
     leap_seconds: int | None = None
 
 
-class MicrostrainParser(StreamParser):
+class MicrostrainParser(FramedParser):
     """Decodes packets of data; NMEA between them is framed and counted.
 
     Args:
@@ -79,43 +78,25 @@ class MicrostrainParser(StreamParser):
     """
 
     def __init__(self, settings: DeviceSettings, *, wanted: tuple[type, ...] | None = None) -> None:
-        super().__init__()
-        self._framer = Framer((MIP, NMEA), self.counters)
-        self._wanted = wanted
+        super().__init__((MIP, NMEA), wanted)
         self._increments = settings.config.get("sample") == "increment"
         self._interval_s = 1.0 / float(settings.config.get("rate_hz") or nan)
         self._by_counter = settings.config.get("pps") is not None
         self._time = UnitTime(settings, self.counters, "GpsTime")
         self._latest = _Latest()
 
-    def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one read; return the records that it completed."""
-        return self._decode_all(self._framer.feed(chunk.data, chunk.host_time_ns))
-
-    def feed_batch(self, batch: ChunkBatch) -> list[Record]:
-        """Take consecutive reads; return neighbouring samples of all of them as one array."""
-        frames: list[Frame] = []
-        for host_time_ns, unit in zip(batch.host_time_ns.tolist(), batch.units, strict=True):
-            frames += self._framer.feed(unit.tobytes(), host_time_ns)
-        return self._decode_all(frames)
-
-    def close(self) -> list[Record]:
-        """Return the records held back."""
-        return self._decode_all(self._framer.close())
-
-    def _decode_all(self, frames: list[Frame]) -> list[Record]:
+    def decode_frames(self, frames: list[Frame]) -> Items:
+        """Decode consecutive frames; return their records, or rows of them, in order."""
         items: Items = []
         for kind, host_time_ns, data in frames:
             if kind != MIP.name:
                 continue
             values = read_values(data)
             if values is None:
-                self._count_bad("bad_length")
+                self.counters.count_bad("bad_length")
             elif values:
                 items += self._decode(host_time_ns, data[2], values)
-        if self._wanted is not None:
-            items = [item for item in items if (item.record if isinstance(item, Row) else type(item)) in self._wanted]
-        return join_rows(items)
+        return items
 
     def _decode(self, host_time_ns: int, descriptor_set: int, values: Values) -> Items:
         if "leap_seconds" in values and values["leap_seconds"][1] & LEAP_SECONDS_VALID:
@@ -132,11 +113,6 @@ class MicrostrainParser(StreamParser):
         elif RECEIVERS.get(descriptor_set) in ANTENNAS:
             items += self._fix(host_time_ns, descriptor_set, values, moment)
         return items + self._status(host_time_ns, descriptor_set, values)
-
-    def _count_bad(self, code: str) -> Items:
-        self.counters.bad_messages += 1
-        self.counters.errors[code] += 1
-        return []
 
     # --- time ---
 
@@ -165,7 +141,8 @@ class MicrostrainParser(StreamParser):
             return []
         force, rate = found
         if not all(map(isfinite, (*force, *rate))):
-            return self._count_bad("bad_value")
+            self.counters.count_bad("bad_value")
+            return []
         device_ns, pps_ns, week = -1, -1, -1
         (reference_ns,) = values.get("reference_ns", (-1,))
         if moment is not None and moment.valid and not self._by_counter:

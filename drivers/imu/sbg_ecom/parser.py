@@ -22,19 +22,18 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside
-from swath.drivers.framing.framer import Frame, Framer
+from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import NMEA
+from swath.drivers.framing.parser import FramedParser
 from swath.drivers.gnss.date_floor import GPS_EPOCH, leap_seconds_of
 from swath.drivers.gnss.epochs import EpochGatherer
-from swath.drivers.gnss.record_rows import Row, join_rows
 from swath.drivers.imu.attitude import angles_of
 from swath.drivers.imu.counters import LATE_LATCH_PART, CounterUnwrapper
 from swath.drivers.imu.sbg_ecom import wire
 from swath.drivers.imu.unit_time import WEEK_NS, Moment, UnitTime
-from swath.drivers.parser import DeviceSettings, DriverSettingsError, StreamParser
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.record_rows import Row
 from swath.georef.records import (
-    Chunk,
-    ChunkBatch,
     DeviceStatus,
     EventMark,
     FixType,
@@ -108,7 +107,7 @@ class _Latest:
     status: tuple[int, ...] = ()
 
 
-class SbgEcomParser(StreamParser):
+class SbgEcomParser(FramedParser):
     """Decodes logs; NMEA between them is framed and counted, as are answers to commands and their large frames.
 
     Args:
@@ -120,11 +119,9 @@ class SbgEcomParser(StreamParser):
     """
 
     def __init__(self, settings: DeviceSettings, *, wanted: tuple[type, ...] | None = None) -> None:
-        super().__init__()
+        super().__init__((wire.SBG_ECOM, NMEA), wanted)
         if settings.config.get("sample") == "increment":
             raise DriverSettingsError('sample: sbg-ecom has no increments; want "mean", which its logs contain')
-        self._framer = Framer((wire.SBG_ECOM, NMEA), self.counters)
-        self._wanted = wanted
         self._by_counter = settings.config.get("pps") is not None
         self._pulse_channel = settings.config.get("pps_event")
         self._time = UnitTime(settings, self.counters, "UTC_TIME")
@@ -132,31 +129,15 @@ class SbgEcomParser(StreamParser):
         self._fixes = {number: EpochGatherer[FixPart](self.counters) for number in ANTENNAS}
         self._latest = _Latest()
 
-    def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one read; return the records that it completed."""
-        return self._join(self._decode_all(self._framer.feed(chunk.data, chunk.host_time_ns)))
-
-    def feed_batch(self, batch: ChunkBatch) -> list[Record]:
-        """Take consecutive reads; return neighbouring samples of all of them as one array."""
-        frames: list[Frame] = []
-        for host_time_ns, unit in zip(batch.host_time_ns.tolist(), batch.units, strict=True):
-            frames += self._framer.feed(unit.tobytes(), host_time_ns)
-        return self._join(self._decode_all(frames))
-
-    def close(self) -> list[Record]:
-        """Return the records held back and the last fixes."""
-        items = self._decode_all(self._framer.close())
+    def finish(self) -> Items:
+        """Return the last fixes."""
+        items: Items = []
         for number, gatherer in self._fixes.items():
             items += self._give_fixes(number, gatherer.end())
-        return self._join(items)
+        return items
 
-    def _join(self, items: Items) -> list[Record]:
-        items = self._unwrap(items)
-        if self._wanted is not None:
-            items = [item for item in items if (item.record if isinstance(item, Row) else type(item)) in self._wanted]
-        return join_rows(items)
-
-    def _decode_all(self, frames: list[Frame]) -> Items:
+    def decode_frames(self, frames: list[Frame]) -> Items:
+        """Decode consecutive frames; return their records, or rows of them, in order."""
         items: Items = []
         for kind, host_time_ns, data in frames:
             log = wire.read_log(data) if kind == wire.SBG_ECOM.name else None
@@ -166,8 +147,8 @@ class SbgEcomParser(StreamParser):
             if values:
                 items += self._decode(host_time_ns, number, values, content)
             else:
-                self._count_bad("bad_length")
-        return items
+                self.counters.count_bad("bad_length")
+        return self._unwrap(items)
 
     def _decode(self, host_time_ns: int, number: int, values: tuple[Any, ...], data: bytes) -> Items:
         if number == wire.UTC_TIME:
@@ -188,11 +169,6 @@ class SbgEcomParser(StreamParser):
             return self._event(host_time_ns, wire.EVENTS[number], values)
         return self._status(host_time_ns, values)
 
-    def _count_bad(self, code: str) -> Items:
-        self.counters.bad_messages += 1
-        self.counters.errors[code] += 1
-        return []
-
     # --- time ---
 
     def _utc_time(self, host_time_ns: int, log: wire.UtcTime) -> Items:
@@ -202,11 +178,13 @@ class SbgEcomParser(StreamParser):
         try:
             date = dt.date(log.year, log.month, log.day)
         except ValueError:
-            return self._count_bad("bad_value")
+            self.counters.count_bad("bad_value")
+            return []
         of_day_ns = ((log.hour * 60 + log.minute) * 60 + log.second) * SECOND_NS + log.nanosecond
         leap = leap_seconds_of(date, of_day_ns // MILLISECOND_NS, log.tow_ms)
         if leap is None or log.hour > 23 or log.minute > 59 or log.second > 60 or log.nanosecond >= SECOND_NS:
-            return self._count_bad("bad_value")
+            self.counters.count_bad("bad_value")
+            return []
         week, tow_ns = divmod((date - GPS_EPOCH).days * DAY_NS + of_day_ns + leap * SECOND_NS, WEEK_NS)
         moment = self._time.moment(week, tow_ns, valid=log.status & CLOCK_STATE == CLOCK_VALID)
         if moment is None:
@@ -239,7 +217,8 @@ class SbgEcomParser(StreamParser):
             return []
         force, rate, celsius = physical(number, status, values)
         if not all(map(isfinite, (*force, *rate))):
-            return self._count_bad("bad_value")
+            self.counters.count_bad("bad_value")
+            return []
         moment = self._moment(stamp_us)
         if moment is not None and moment.valid and not self._by_counter:
             return [Row(ImuSamples, (host_time_ns, moment.tow_ns, -1, force, rate, celsius, status, moment.week))]
@@ -298,11 +277,15 @@ class SbgEcomParser(StreamParser):
             self.counters.errors["time_unknown"] += 1
             return []
         row = ins_row(host_time_ns, moment, nav, euler)
-        return [row] if row is not None else self._count_bad("bad_value")
+        if row is None:
+            self.counters.count_bad("bad_value")
+            return []
+        return [row]
 
     def _add_fix(self, receiver: int, name: str, part: FixPart) -> Items:
         if part.log.tow_ms >= WEEK_MS:
-            return self._count_bad("bad_value")
+            self.counters.count_bad("bad_value")
+            return []
         return self._give_fixes(receiver, self._fixes[receiver].add(part.log.tow_ms, name, part))
 
     def _give_fixes(self, receiver: int, epochs: list[dict[str, FixPart]]) -> Items:

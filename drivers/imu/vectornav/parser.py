@@ -22,17 +22,16 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside
-from swath.drivers.framing.framer import Frame, Framer
+from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import NMEA
-from swath.drivers.gnss.record_rows import Row, join_rows
+from swath.drivers.framing.parser import FramedParser
 from swath.drivers.imu.attitude import angles_of
 from swath.drivers.imu.unit_time import WEEK_NS, Moment, UnitTime
 from swath.drivers.imu.vectornav.startup import receiver_startup_messages, startup_messages
 from swath.drivers.imu.vectornav.wire import VECTORNAV, read_values
-from swath.drivers.parser import DeviceSettings, StreamParser
+from swath.drivers.parser import DeviceSettings
+from swath.drivers.record_rows import Row
 from swath.georef.records import (
-    Chunk,
-    ChunkBatch,
     DeviceStatus,
     FixType,
     GnssFix,
@@ -79,7 +78,7 @@ class _Epochs:
     leap_seconds: int | None = None
 
 
-class VectornavParser(StreamParser):
+class VectornavParser(FramedParser):
     """Decodes binary output messages; ASCII messages between them are framed and counted.
 
     Args:
@@ -88,30 +87,13 @@ class VectornavParser(StreamParser):
     """
 
     def __init__(self, settings: DeviceSettings, *, wanted: tuple[type, ...] | None = None) -> None:
-        super().__init__()
-        self._framer = Framer((VECTORNAV, NMEA), self.counters)
+        super().__init__((VECTORNAV, NMEA), wanted)
         self._source = settings.source
-        self._wanted = wanted
         self._increments = settings.config.get("sample") == "increment"
         self._by_counter = settings.config.get("pps") is not None
         self._time = UnitTime(settings, self.counters, "TimeGps")
         self._latest = _Epochs()
         self._compensated = False
-
-    def feed(self, chunk: Chunk) -> list[Record]:
-        """Take one read; return the records that it completed."""
-        return self._decode_all(self._framer.feed(chunk.data, chunk.host_time_ns))
-
-    def feed_batch(self, batch: ChunkBatch) -> list[Record]:
-        """Take consecutive reads; return neighbouring samples of all of them as one array."""
-        frames: list[Frame] = []
-        for host_time_ns, unit in zip(batch.host_time_ns.tolist(), batch.units, strict=True):
-            frames += self._framer.feed(unit.tobytes(), host_time_ns)
-        return self._decode_all(frames)
-
-    def close(self) -> list[Record]:
-        """Return the records held back."""
-        return self._decode_all(self._framer.close())
 
     def remarks(self) -> list[str]:
         """Return a remark where the samples have the device's own biases subtracted."""
@@ -122,14 +104,13 @@ class VectornavParser(StreamParser):
             "output UncompAccel and UncompGyro"
         ]
 
-    def _decode_all(self, frames: list[Frame]) -> list[Record]:
+    def decode_frames(self, frames: list[Frame]) -> Items:
+        """Decode consecutive frames; return their records, or rows of them, in order."""
         items: Items = []
         for kind, host_time_ns, data in frames:
             if kind == VECTORNAV.name:
                 items += self._decode(host_time_ns, read_values(data))
-        if self._wanted is not None:
-            items = [item for item in items if (item.record if isinstance(item, Row) else type(item)) in self._wanted]
-        return join_rows(items)
+        return items
 
     def _decode(self, host_time_ns: int, values: Values) -> Items:
         moment = self._moment(values)
@@ -144,11 +125,6 @@ class VectornavParser(StreamParser):
             *self._solution(host_time_ns, values, moment),
             *self._status(host_time_ns, values),
         ]
-
-    def _count_bad(self, code: str) -> Items:
-        self.counters.bad_messages += 1
-        self.counters.errors[code] += 1
-        return []
 
     # --- time ---
 
@@ -173,7 +149,8 @@ class VectornavParser(StreamParser):
             return []
         force, rate = found
         if not all(map(isfinite, (*force, *rate))):
-            return self._count_bad("bad_value")
+            self.counters.count_bad("bad_value")
+            return []
         startup_ns = values.get("time_startup", (-1,))[0]
         device_ns, pps_ns, week = -1, -1, -1
         if moment is not None and moment.valid and not self._by_counter:
@@ -252,7 +229,8 @@ class VectornavParser(StreamParser):
         latitude, longitude, height = values["pos_lla"]
         velocity = values.get("vel_ned", (nan,) * 3)
         if not all(map(isfinite, (latitude, longitude, height, *angles))):
-            return self._count_bad("bad_value")
+            self.counters.count_bad("bad_value")
+            return []
         yaw_sigma, pitch_sigma, roll_sigma = map(radians, values.get("ypr_sigma", (nan,) * 3))
         row = (
             host_time_ns,

@@ -173,7 +173,7 @@ class HesaiParser(PacketParser):
         if length == GPS_BYTES:
             return self._gps.read(host_time_ns, units)
         if length not in self._layouts:
-            self._refuse("bad_length", len(units), length)
+            self.counters.count_bad("bad_length", len(units), length)
             return []
         layout = self._layouts[length]
         packets = units.view(layout.dtype)[:, 0]
@@ -230,7 +230,7 @@ class HesaiParser(PacketParser):
                 & (counts_seconds | ((utc["hour"] < 24) & (utc["minute"] < 60) & (utc["second"] <= 60))),
             ),
         ):
-            self._refuse(code, int((good & ~passes).sum()), packets.dtype.itemsize)
+            self.counters.count_bad(code, int((good & ~passes).sum()), packets.dtype.itemsize)
             good &= passes
         return good
 
@@ -241,12 +241,6 @@ class HesaiParser(PacketParser):
             return header
         blocks: BoolArray = (packets["blocks"]["sop"] == BLOCK_SOP).all(axis=1)
         return blocks
-
-    def _refuse(self, code: str, count: int, length: int) -> None:
-        if count:
-            self.counters.errors[code] += count
-            self.counters.bad_messages += count
-            self.counters.bytes_skipped += count * length
 
     def _follow(
         self, host_time_ns: Int64Array, packets: StructArray, second_ns: Int64Array

@@ -107,7 +107,7 @@ class LivoxParser(PacketParser):
         self.counters.bytes += units.size
         length = units.shape[1]
         if length <= self._header.itemsize:
-            self._refuse("bad_length", len(units), length)
+            self.counters.count_bad("bad_length", len(units), length)
             return []
         if not len(units):
             return []
@@ -118,7 +118,7 @@ class LivoxParser(PacketParser):
         if not len(headers):
             return []
         time_ns, right = self._times(host_time_ns, headers)
-        self._refuse("bad_time", int((~right).sum()), length)
+        self.counters.count_bad("bad_time", int((~right).sum()), length)
         if not right.all():
             host_time_ns, headers, units, time_ns = host_time_ns[right], headers[right], units[right], time_ns[right]
         self._count(headers, length)
@@ -157,7 +157,7 @@ class LivoxParser(PacketParser):
         ]
         for code, passes in criteria:
             found = passes()
-            self._refuse(code, int((good & ~found).sum()), length)
+            self.counters.count_bad(code, int((good & ~found).sum()), length)
             good &= found
         if self._head.sdk == 2:
             bad = good & ~_crc_holds(headers, units)
@@ -165,7 +165,7 @@ class LivoxParser(PacketParser):
             self.counters.bytes_skipped += int(bad.sum()) * length
             return good & ~bad
         own = self._of_own_place(headers, good)
-        self._refuse("other_head", int((good & ~own).sum()), length)
+        self.counters.count_bad("other_head", int((good & ~own).sum()), length)
         return good & own
 
     def _fits(self, headers: StructArray, length: int) -> BoolArray:
@@ -213,12 +213,6 @@ class LivoxParser(PacketParser):
                 time_ns[chosen] = self._since_pulse.add(time_ns[chosen], host_time_ns[chosen])
                 right &= time_ns >= 0
         return time_ns, right
-
-    def _refuse(self, code: str, count: int, length: int) -> None:
-        if count:
-            self.counters.errors[code] += count
-            self.counters.bad_messages += count
-            self.counters.bytes_skipped += count * length
 
     def _count(self, headers: StructArray, length: int) -> None:
         self.counters.bytes_framed += len(headers) * length

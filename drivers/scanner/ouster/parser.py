@@ -163,14 +163,8 @@ class OusterParser(PacketParser):
         if length == ZONE_BYTES and not self.layout.legacy:
             self._keep(units, ZONE_PACKET, "zone")
             return []
-        self._refuse("bad_length", len(units), length)
+        self.counters.count_bad("bad_length", len(units), length)
         return []
-
-    def _refuse(self, code: str, count: int, length: int) -> None:
-        if count:
-            self.counters.errors[code] += count
-            self.counters.bad_messages += count
-            self.counters.bytes_skipped += count * length
 
     def _keep(self, units: ByteRows, packet_type: int, name: str) -> BoolArray:
         """Return (n,) which packets with a header are of this type and intact; count all of them."""
@@ -183,7 +177,7 @@ class OusterParser(PacketParser):
         """Clear in ``good`` the packets that fail a criterion; count these and the packets with a bad checksum."""
         self._bad_checksums(int((~good).sum()), length)
         for code, passes in criteria:
-            self._refuse(code, int((good & ~passes).sum()), length)
+            self.counters.count_bad(code, int((good & ~passes).sum()), length)
             good &= passes
 
     def _origin(self, headers: StructArray, packet_type: int) -> list[tuple[str, BoolArray]]:

@@ -153,7 +153,7 @@ class RobosenseParser(PacketParser):
         """Decode packets of equal length; see `PacketParser.parse_units`."""
         self.counters.bytes += units.size
         if units.shape[1] != PACKET_BYTES:
-            self._refuse("bad_length", len(units))
+            self.counters.count_bad("bad_length", len(units))
             self.counters.bytes_skipped += units.size
             return []
         difop = (units[:, : len(_DIFOP_START)] == _DIFOP_START).all(axis=1)
@@ -237,14 +237,9 @@ class RobosenseParser(PacketParser):
             ("bad_azimuth", (packets["blocks"]["azimuth"] < FULL_CIRCLE).all(axis=1)),
             ("bad_time", times_good),
         ):
-            self._refuse(code, int((good & ~passes).sum()))
+            self.counters.count_bad(code, int((good & ~passes).sum()))
             good &= passes
         return good
-
-    def _refuse(self, code: str, count: int) -> None:
-        if count:
-            self.counters.errors[code] += count
-            self.counters.bad_messages += count
 
     def _stamps(self, packets: StructArray) -> tuple[Int64Array, BoolArray]:
         """Return (n,) times in nanoseconds since 1970, and whether they are possible."""

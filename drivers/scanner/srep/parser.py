@@ -187,12 +187,12 @@ class SrepParser(PacketParser):
         size, lengths = sum(block.size for block in units.blocks), units.lengths()
         if min(block.shape[1] for block in units.blocks) < HEADER_BYTES + CRC.size:
             long = lengths >= HEADER_BYTES + CRC.size
-            self._refuse("bad_length", int((~long).sum()))
+            self.counters.count_bad("bad_length", int((~long).sum()))
             units, chosen, lengths = units.where(long), chosen[long], lengths[long]
         header = units.headers()
         good = np.ones(len(units), dtype=np.bool_)
         for code, passes in header_checks(header, lengths):
-            self._refuse(code, int((good & ~passes).sum()))
+            self.counters.count_bad(code, int((good & ~passes).sum()))
             good &= passes
         verify = good if self._thinner is None else good & (chosen | self._breaks(header["sequence"], good))
         agree = units.where(verify).agree_with_crc()
@@ -216,11 +216,6 @@ class SrepParser(PacketParser):
             follows[0] = int(sequence[0]) == (self._last_sequence + 1) % (1 << 32)
         self._last_sequence = int(sequence[-1]) if good[-1] else None
         return ~follows
-
-    def _refuse(self, code: str, count: int) -> None:
-        if count:
-            self.counters.errors[code] += count
-            self.counters.bad_messages += count
 
     def _status(self, host_time_ns: Int64Array, header: StructArray) -> list[DeviceStatus]:
         """Return a status for each datagram whose flags, id or pulse rate differ from the one before."""

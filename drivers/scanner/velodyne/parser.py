@@ -131,7 +131,7 @@ class VelodyneParser(PacketParser):
         if units.shape[1] == POSITION_BYTES:
             return self._position.read(host_time_ns, units)
         if units.shape[1] != PACKET_BYTES:
-            self._refuse("bad_length", len(units), units.shape[1])
+            self.counters.count_bad("bad_length", len(units), units.shape[1])
             return []
         packets = units.view(PACKET_DTYPE)[:, 0]
         good = self._check(packets)
@@ -184,15 +184,9 @@ class VelodyneParser(PacketParser):
             ("bad_return_mode", np.isin(mode, RETURN_MODES)),
             ("bad_azimuth", azimuths_right),
         ):
-            self._refuse(code, int((good & ~passes).sum()), PACKET_BYTES)
+            self.counters.count_bad(code, int((good & ~passes).sum()), PACKET_BYTES)
             good &= passes
         return good
-
-    def _refuse(self, code: str, count: int, length: int) -> None:
-        if count:
-            self.counters.errors[code] += count
-            self.counters.bad_messages += count
-            self.counters.bytes_skipped += count * length
 
     def _follow(self, packets: StructArray) -> tuple[BoolArray, FloatArray]:
         """Find missing packets between the stamps; follow the rotation from packet to packet.

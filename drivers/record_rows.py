@@ -17,11 +17,13 @@ class Row(NamedTuple):
     values: tuple[Any, ...]
 
 
-def join_rows(items: Iterable[Record | Row]) -> list[Record]:
-    """Return records in order; neighbouring rows of one kind become one array."""
+def join_rows(items: Iterable[Record | Row], wanted: tuple[type, ...] | None = None) -> list[Record]:
+    """Return the records of the wanted types (None: all) in order; neighbouring rows of one kind become one array."""
     records: list[Record] = []
     run: list[Row] = []
     for item in items:
+        if wanted is not None and (item.record if isinstance(item, Row) else type(item)) not in wanted:
+            continue
         if run and not (isinstance(item, Row) and item.record is run[0].record):
             records.append(_array(run))
             run = []
