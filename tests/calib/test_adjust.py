@@ -474,7 +474,7 @@ def test_a_flight_that_contradicts_a_held_parameter_reports_it() -> None:
 
 @pytest.mark.parametrize("name", ["kappa_rad", "scan_angle_scale"])
 def test_a_fixed_parameter_is_reported_as_wrong_if_the_flight_contradicts_it(name: str) -> None:
-    """It is reported even if its error is plausible; its sigma stays the plausible one."""
+    """A plausible error is reported too, and the held parameter keeps its plausible sigma."""
     built = made(truth=SCALED)
     prior, start = gauss_markov(built.flight, Taus(), 4.0), {"left": replace(built.truth, method="nominal")}
     options, away = ParameterOptions(fix=frozenset([name])), {"kappa_rad": 3e-3, "scan_angle_scale": 2.5e-4}[name]

@@ -110,7 +110,7 @@ def test_displaced_planes_are_found_again_after_alignment(cast: Cast, flight: Fl
 
 
 def test_a_displaced_swath_is_dropped(flight: Flight, settled: Features) -> None:
-    """It is half a metre higher than the other two, which hold the planes."""
+    """The displaced swath lies half a metre above the other two, which hold the planes."""
     matched = rematch(shifted(flight, 1, 0.5), settled)
     kept = [plane for plane in matched.planes if {patch.swath for patch in plane.patches} == {0, 2}]
     assert len(kept) > 0.9 * sum({0, 2} <= {patch.swath for patch in plane.patches} for plane in settled.planes)

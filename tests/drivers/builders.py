@@ -14,10 +14,11 @@ import numpy as np
 
 from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.gnss.novatel.parser import NovatelParser
-from swath.drivers.parser import DeviceSettings, PacketParser
+from swath.drivers.parser import DeviceSettings, Parser
 from swath.georef.arrays import StructArray
 from swath.georef.records import (
     Chunk,
+    ChunkBatch,
     DeviceClockSamples,
     ImuSamples,
     InsSolution,
@@ -162,7 +163,7 @@ def nmea2000_bus(name: str) -> tuple[bytes, ...]:
     )
 
 
-def feed(parser: PacketParser, units: list[bytes]) -> list[Record]:
+def feed(parser: Parser, units: list[bytes]) -> list[Record]:
     """Parse units, one millisecond apart; consecutive ones of equal length form a batch."""
     records: list[Record] = []
     at = 0
@@ -171,7 +172,7 @@ def feed(parser: PacketParser, units: list[bytes]) -> list[Record]:
         while stop < len(units) and len(units[stop]) == len(units[at]):
             stop += 1
         rows = np.frombuffer(b"".join(units[at:stop]), dtype=np.uint8).reshape(stop - at, -1)
-        records += parser.parse_units(np.arange(at, stop, dtype=np.int64) * 1_000_000, rows)
+        records += parser.feed_batch(ChunkBatch("", np.arange(at, stop, dtype=np.int64) * 1_000_000, rows))
         at = stop
     return records
 

@@ -211,7 +211,7 @@ def check_velodyne(copy: Path, entry: Entry) -> None:
     data = [unit for unit in units if len(unit) == 1206]
     assert Counter(f"0x{unit[-2]:02x},0x{unit[-1]:02x}" for unit in data) == entry["factory_bytes_return_product"]
     parser = find_driver("scanner", protocol).make_parser(DeviceSettings("scanner/left"))
-    records = feed(parser, data)  # type: ignore[arg-type]
+    records = feed(parser, data)
     assert +parser.counters.messages == {"data": len(data)}
     wanted = entry["data_packet_us_past_hour"]
     last_firing_us = clock_of(records)["device_time_ns"] / 1000  # the entry has the stamps, of the first firing
@@ -237,7 +237,7 @@ def check_hesai(copy: Path, entry: Entry) -> None:
     span_s = (captured[-1].time_ns - captured[0].time_ns) * 1e-9
     assert span_s == pytest.approx(entry["capture_span_s"], abs=1e-6)
     parser = find_driver("scanner", protocol).make_parser(DeviceSettings("scanner/left"))
-    assert any(isinstance(record, ScannerReturns) for record in feed(parser, units))  # type: ignore[arg-type]
+    assert any(isinstance(record, ScannerReturns) for record in feed(parser, units))
     assert parser.counters.messages.total() == len(units)
     cloud = content(FIXTURES / "hesai" / (Path(entry["golden_pcd"]["file"]).name + ".gz"))
     assert f"\nPOINTS {entry['golden_pcd']['points']}\n".encode() in cloud
@@ -254,7 +254,7 @@ def check_ouster(copy: Path, entry: Entry) -> None:
         assert head.profile == sensor["profile"]
     settings = DeviceSettings("scanner/left", {}, {"geometry": metadata})
     parser = find_driver("scanner", "ouster").make_parser(settings)
-    feed(parser, units)  # type: ignore[arg-type]
+    feed(parser, units)
     kinds = {"LidarPacket": "lidar", "ImuPacket": "imu", "ZonePacket": "zone"}
     assert +parser.counters.messages == {kinds[kind]: count for kind, count in entry["sdk_packets"].items()}
     wanted = json.loads((FIXTURES / "ouster" / "expected.json").read_text())[f"{name}.pcap"]["scans"]

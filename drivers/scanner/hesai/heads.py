@@ -1,4 +1,4 @@
-"""What differs between Hesai heads: layout of the packets, firing times of the lasers, directions of the beams.
+"""Describes Hesai heads: layout of the packets, firing times of the lasers, directions of the beams.
 
 A packet has a header, blocks, a tail. A block is the azimuth and one return of each laser; one, two or three blocks
 with the same azimuth are a round of firing. The models are in `swath.drivers.scanner.hesai.models`.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -136,8 +136,8 @@ class HesaiHead:
             }
         )
         block = np.dtype([*self.block, ("returns", channel, (self.channels,))])
-        fields: list[tuple[str, object]] = [*self.header]
-        fields.append(("blocks", block, (self.blocks,)))  # type: ignore[arg-type]
+        fields: list[tuple[Any, ...]] = [*self.header]
+        fields.append(("blocks", block, (self.blocks,)))
         for name, kind, there in (
             ("body_crc", "<u4", self.has_crc),
             ("safety", f"V{SAFETY_BYTES}", flags & SAFETY),

@@ -91,12 +91,12 @@ class PointType:
 
     @property
     def is_polar(self) -> bool:
-        """Whether directions are angles."""
+        """True if directions are angles; otherwise they are x, y, z."""
         return "zenith" in (self.dtype.names or ())
 
     @property
     def has_tag(self) -> bool:
-        """Whether a return has a tag."""
+        """True if a return has a tag."""
         return self.echoes > 1 or "tag" in (self.dtype.names or ())
 
 

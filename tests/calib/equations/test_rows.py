@@ -262,7 +262,7 @@ def looks_of(flight: Flight, planes: tuple[Plane, ...], options: ParameterOption
     [("range_m", RANGES_ONLY, 1.2, 2e-6), ("encoder_rad", Noise(1e-9, 4e-4, 0.0, 0.0), 1e-3, 2e-4)],
 )
 def test_rows_use_the_adjusted_observations(name: str, noise: Noise, errors: float, tolerance: float) -> None:
-    """Where only ranges or only angles err, the adjusted ones are the true ones, and so are all coefficients."""
+    """If only ranges or only angles err, the adjusted observations and all coefficients are the true ones."""
     normal = np.array([0.5, -0.3, 0.81])
     planes = [(np.array([150.0, 0.0, 400.0]), normal / np.linalg.norm(normal))]
     still = trajectory(LINES[:1])

@@ -327,7 +327,7 @@ def test_planes_are_recorded_with_their_derivatives(outcome: Outcome) -> None:
 
 @pytest.mark.parametrize(("nodes", "whole"), [(160, True), (240, False)])
 def test_a_correction_by_intensity_is_recorded(outcome: Outcome, nodes: int, whole: bool) -> None:
-    """It is recorded only if it exists, and a long table is attached like other large matrices."""
+    """A record without a correction has no entry, and a long table is attached like other large matrices."""
     assert "CA_Intensity.intensityCorrection" not in numbers(outcome)
     table = np.linspace(0.0, 1000.0, nodes + 1), np.linspace(-0.02, 0.03, nodes + 1)
     calibration = replace(outcome.adjusted.calibrations["left"], ibrc=table)

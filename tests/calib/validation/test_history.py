@@ -138,7 +138,7 @@ IBRC = np.array([200.0, 2000.0])
     ],
 )
 def test_a_parameter_held_at_another_value_is_not_a_change(other: dict[str, Any], said: str) -> None:
-    """It gives neither a step nor a line through all entries; steps between the other entries are judged."""
+    """An entry with another held value is left out of steps and lines; the other entries are judged."""
     values = {name: value for name, value in other.items() if name in INDEX}
     tables = {name: value for name, value in other.items() if name not in INDEX}
     entries = [replace(made(number), refraction="none") for number in (1, 2, 3)]

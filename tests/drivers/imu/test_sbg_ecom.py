@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import struct
+from functools import partial
 from math import degrees, nan, radians
 from typing import Any
 
@@ -159,7 +160,7 @@ def test_the_made_stream_however_cut_and_damaged() -> None:
 @pytest.mark.slow
 def test_the_made_stream_cut_everywhere() -> None:
     for config in ({}, {"pps": "main", "pps_event": "A"}):
-        check_stream(lambda config=config: make(**config), flight()[:6000])  # type: ignore[misc]
+        check_stream(partial(make, **config), flight()[:6000])
 
 
 def test_a_length_over_the_bound_and_a_wrong_end_are_no_frame() -> None:

@@ -176,7 +176,10 @@ def test_the_quaternion_is_the_same_attitude_as_the_angles() -> None:
     for name in (IMU_FILE, GNSS_FILE, DYNAMIC_FILE):
         for message in messages(name):
             values = wire.read_values(message)
-            turn = np.subtract(attitude({"quaternion": values["quaternion"]}), attitude(values))  # type: ignore[arg-type]
+            by_quaternion, by_angles = attitude({"quaternion": values["quaternion"]}), attitude(values)
+            assert by_quaternion is not None
+            assert by_angles is not None
+            turn = np.subtract(by_quaternion, by_angles)
             assert abs((np.degrees(turn) + 180) % 360 - 180).max() < 0.01
 
 

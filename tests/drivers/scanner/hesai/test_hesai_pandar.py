@@ -183,4 +183,4 @@ def test_made_packets_are_decoded_by_their_driver(protocol: str) -> None:
     assert len(returns_of(feed(parser, units))) > 1000
     assert parser.counters.messages == {"points": len(units)}
     assert driver.make_time_parser is not None
-    assert {type(one) for one in feed(driver.make_time_parser(DeviceSettings("x")), units)} == {DeviceClockSamples}  # type: ignore[arg-type]
+    assert {type(one) for one in feed(driver.make_time_parser(DeviceSettings("x")), units)} == {DeviceClockSamples}

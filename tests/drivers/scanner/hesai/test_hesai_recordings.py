@@ -136,7 +136,7 @@ def test_the_driver_declares_its_records(model: Model) -> None:
     assert driver.transports == ("udp",)
     assert driver.make_time_parser is not None
     units = [*payloads(model.capture)[:100], encode_gps_packet(NOON)]
-    records = feed(driver.make_time_parser(model.settings()), units)  # type: ignore[arg-type]
+    records = feed(driver.make_time_parser(model.settings()), units)
     given_types = {type(record) for record in records}
     assert given_types == {DeviceClockSamples, TimeMessage, DeviceStatus}
     assert given_types | {ScannerReturns} == set(driver.yields)

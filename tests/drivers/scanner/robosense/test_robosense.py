@@ -279,9 +279,9 @@ def test_the_driver_declares_its_records(name: str) -> None:
     file = DeviceSettings("scanner/left", {}, {"geometry": (FIXTURES / "robosense" / f"{name}.difop").read_bytes()})
     assert driver.make_time_parser is not None
     assert driver.make_probe is not None
-    records = feed(driver.make_time_parser(file), units)  # type: ignore[arg-type]
+    records = feed(driver.make_time_parser(file), units)
     assert {type(record) for record in records} == {DeviceClockSamples}
     assert len(clock_of(records)) < len(units)
     probe = driver.make_probe(DeviceSettings("scanner/left"))
-    assert len(returns_of(feed(probe, units))) > 1000  # type: ignore[arg-type]
+    assert len(returns_of(feed(probe, units))) > 1000
     assert probe.counters.messages["data"] >= 20

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pytest
@@ -293,8 +294,8 @@ def test_returns_of_every_head_do_not_depend_on_how_batches_are_cut() -> None:
                 units.append(encode_data_packet(int(stamp_us) % 3_600_000_000, turned, ranges, at, mode, head))
             stamp_us += groups * head.group_ns / 1000
         units.insert(40, encode_position_packet(3_599_999_000, 2, ""))
-        check_packets(lambda head=head: make_parser(head), units)  # type: ignore[misc]
-        check_packet_damage(lambda head=head: make_parser(head), units[25:45], examples=15)  # type: ignore[misc]
+        check_packets(partial(make_parser, head), units)
+        check_packet_damage(partial(make_parser, head), units[25:45], examples=15)
 
 
 def test_a_puck_hi_res_has_its_own_angles() -> None:
@@ -380,9 +381,9 @@ def test_the_driver_declares_its_records(protocol: str) -> None:
         encode_position_packet(2_500_000, 2, ""),
         packet(head, stamp_us=2_900_000),
     ]
-    thinned = feed(driver.make_time_parser(DeviceSettings("scanner/left")), units)  # type: ignore[arg-type]
+    thinned = feed(driver.make_time_parser(DeviceSettings("scanner/left")), units)
     assert {type(record) for record in thinned} == {DeviceClockSamples, DeviceStatus}
-    records = feed(driver.make_parser(DeviceSettings("scanner/left")), units)  # type: ignore[arg-type]
+    records = feed(driver.make_parser(DeviceSettings("scanner/left")), units)
     assert {type(record) for record in records} == {DeviceClockSamples, DeviceStatus, ScannerReturns}
     assert returns_of(records)["range_m"][0] == pytest.approx(5000 * head.range_unit_m)
 
