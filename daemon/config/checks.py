@@ -135,7 +135,9 @@ def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTabl
         yield from _check_clock(section, table, driver)
     needs = list(_check_needs(section, table, driver))
     yield from needs
-    if not needs and not any(_unreadable(path) for path in config.files_of(table).values()):
+    carrier = config.carrier_of(table)  # its files are read too
+    tables = [table] if carrier is None else [table, carrier[1]]
+    if not needs and not any(_unreadable(path) for one in tables for path in config.files_of(one).values()):
         settings = config.settings_of(kind, name, table)
         try:
             driver.make_parser(settings)

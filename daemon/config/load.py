@@ -140,7 +140,7 @@ def _wanted(kind: str, context: Mapping[str, Any], field: FieldInfo | None) -> s
     if kind in ("too_short", "too_long"):
         # lists of numbers and of names have a fixed length, lists of tables a maximum
         at_most = "at most " if kind == "too_long" and field is not None and _model_in(field.annotation) else ""
-        return f"{at_most}{context.get('min_length', context.get('max_length'))} of them"
+        return f"{at_most}{context.get('min_length', context.get('max_length'))} values"
     if kind == "string_too_long":
         return f"at most {context['max_length']} characters"
     if kind == "string_too_short":
