@@ -41,7 +41,8 @@ def command(
     else:
         if offline:
             sources = _sources(loaded)
-            print(f"{loaded.path}: valid; {len(sources)} sources: {', '.join(sources) or 'none'}")
+            count = "1 source" if len(sources) == 1 else f"{len(sources)} sources"
+            print(f"{loaded.path}: valid; {count}: {', '.join(sources) or 'none'}")
         else:
             _print_reports(reports)
         for line in [*geometry_lines(placed), *drawing(placed)]:
