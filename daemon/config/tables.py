@@ -190,6 +190,9 @@ class ImuConfig(Section):
     altitude: Literal["geoid", "ellipsoid"] = Field(
         "geoid", description="oxts-ncom: what the unit's altitude counts from, by its own configuration"
     )
+    solution_of: Literal["vehicle", "sensor1", "sensor2"] = Field(
+        "vehicle", description="applanix-pos: the point whose navigation is the solution"
+    )
     rate_hz: float = Field(200.0, gt=0.0, le=100_000.0, description="nominal sample rate")
     rotation_b_imu: Matrix = Field(
         default_factory=_identity,

@@ -1,4 +1,4 @@
-"""Applanix POS groups as tables, and an encoder (POS AV V6 and POS LV V5 user interface control documents).
+"""Applanix POS groups as tables, and an encoder (POS AV V6, POS LV V5 and POS MV V5 user interface control documents).
 
 A group is ``$GRP``, its number, a length, the time and distance fields, its data, padding, a checksum and ``$#``.
 All numbers are little-endian, angles in degrees.
@@ -117,6 +117,18 @@ class GnssStatus(NamedTuple):
     status: int
 
 
+class ImuHead(NamedTuple):
+    """Group 4, time-tagged IMU data, behind its six counts of velocity and angle (POS TNG3 core ICD, table 19)."""
+
+    bad_frames: int  # bits: one, two, three bad frames of the IMU
+    imu_type: int  # the maker's own designation
+    rate: int
+    imu_status: int
+
+
+IMU_RATES_HZ = (50, 100, 200, 400, 125, 500)  # by ImuHead.rate
+
+
 class Event(NamedTuple):
     """Groups 5 and 6, events 1 and 2."""
 
@@ -141,11 +153,50 @@ class General(NamedTuple):
     status_c: int
 
 
+class SensorNavigation(NamedTuple):
+    """Groups 102 and 103, navigation of sensors 1 and 2 (POS MV V5 ICD, table 29): attitude of the sensor's frame."""
+
+    lat_deg: float
+    lon_deg: float
+    height_m: float
+    along_mps: float
+    across_mps: float
+    down_mps: float
+    roll_deg: float
+    pitch_deg: float
+    heading_deg: float
+    wander_deg: float
+    heave_m: float  # down
+    x_rate_dps: float
+    y_rate_dps: float
+    z_rate_dps: float
+    x_acceleration_mps2: float
+    y_acceleration_mps2: float
+    z_acceleration_mps2: float
+
+
+class SensorPerformance(NamedTuple):
+    """Groups 104 and 105, performance metrics of sensors 1 and 2: RMS errors (POS MV V5 ICD, table 30)."""
+
+    north_m: float
+    east_m: float
+    down_m: float
+    along_mps: float
+    across_mps: float
+    down_mps: float
+    roll_deg: float
+    pitch_deg: float
+    heading_deg: float
+
+
 NAVIGATION = Layout(1, Navigation, "dddfffddddffffffffB")
 PERFORMANCE = Layout(2, Performance, "12f")
+IMU = Layout(4, ImuHead, "24xBBBH")
 EVENT_1, EVENT_2 = Layout(5, Event, "I"), Layout(6, Event, "I")
 PPS = Layout(7, Pps, "IB")
 GENERAL = Layout(10, General, "III")
+SENSORS = tuple(Layout(number, SensorNavigation, "dddfffddddfffffff") for number in (102, 103))
+SENSOR_PERFORMANCES = tuple(Layout(number, SensorPerformance, "9f") for number in (104, 105))
 GNSS_STATUS_NUMBER = 3
 _GNSS_HEAD = struct.Struct("<bBH")  # solution, satellites, bytes of the channels
 _GNSS_TAIL = struct.Struct("<fffHIdffHI")

@@ -9,8 +9,12 @@ GSOF: records of one report make one `GnssFix` (1, 2, 8, 12, 70). Record 1 on th
 edge. 49 makes a row of `InsSolution`, with the sigmas of a 50 of the same time or else of the last 50 of a second.
 
 POS: group 1 makes a row, with the sigmas of the last group 2 of a second. Its week comes from group 3. Group 7 is sent
-for each pulse and names it; groups 5 and 6 are events, 10 the status. Group 4 has counts of the IMU whose scale the
-document does not give, groups 102 and 103 the navigation of other points of the vehicle: both are counted only.
+for each pulse and names it; groups 5 and 6 are events, 10 the status. With ``solution_of`` the rows are those of sensor
+1 or 2 instead, from groups 102 and 104 or 103 and 105 (`SensorSolutions`).
+
+Group 4 has increments of velocity and angle in counts. The maker publishes neither their scale nor the corrections in
+them ("U.S. and Canadian export control laws prohibit publication of the IMU data format", POS MV V5 ICD, group 4): each
+is counted as ``imu_scale_unknown``, its bad frames as ``imu_bad_frames``, and the IMU's type becomes a status.
 
 Rows without alignment (GSOF below "aligned", POS beyond "fine alignment") are counted as ``ins_not_aligned``.
 """
@@ -19,8 +23,8 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from math import cos, isfinite, nan, radians, sin
+from dataclasses import replace
+from math import cos, isfinite, sin
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -31,8 +35,16 @@ from swath.drivers.framing.kinds import GENOUT, NMEA, POS, pos_name
 from swath.drivers.framing.parser import FramedParser
 from swath.drivers.gnss.applanix import groups as pos
 from swath.drivers.gnss.applanix import gsof
+from swath.drivers.gnss.applanix.solution import (
+    WEEK_NS,
+    SensorSolutions,
+    Sigmas,
+    Triple,
+    navigation_row,
+    sigmas_of,
+)
 from swath.drivers.gnss.date_floor import WEEK_MS, ReceiverDates
-from swath.drivers.parser import DeviceSettings
+from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.drivers.record_rows import Row
 from swath.georef.records import (
     DeviceStatus,
@@ -49,60 +61,8 @@ from swath.georef.records import (
 from swath.georef.timescales.gps_time import MILLISECOND_NS, SECOND_NS
 
 Items: TypeAlias = list[Record | Row]
-Triple: TypeAlias = tuple[float, float, float]
 
-WEEK_NS = WEEK_MS * MILLISECOND_NS
 WEEK_S = WEEK_MS // 1000
-SIGMAS_LAST_NS = 1_500_000_000  # sigmas are sent once a second or with every epoch
-UNKNOWN: Triple = (nan, nan, nan)
-
-
-@dataclass(frozen=True, slots=True)
-class Sigmas:
-    """Sigmas of position, velocity and attitude (m, m/s, rad) at a time of week."""
-
-    time_ns: int
-    position_l: Triple
-    velocity_l: Triple
-    attitude_rad: Triple
-
-
-def sigmas_of(time_ns: int, values: tuple[float, ...]) -> Sigmas:
-    """Return sigmas of nine RMS errors: north, east, down, twice, and roll, pitch, heading in degrees."""
-    return Sigmas(
-        time_ns,
-        (values[0], values[1], values[2]),
-        (values[3], values[4], values[5]),
-        (radians(values[6]), radians(values[7]), radians(values[8])),
-    )
-
-
-def navigation_row(
-    host_time_ns: int,
-    week: int,
-    time_ns: int,
-    navigation: gsof.InsNavigation | pos.Navigation,
-    sigmas: Sigmas | None,
-) -> Row:
-    """Return a row of `INS_DTYPE`; its status is the alignment status."""
-    apart = None if sigmas is None else (time_ns - sigmas.time_ns + WEEK_NS // 2) % WEEK_NS - WEEK_NS // 2
-    known = sigmas if apart is not None and abs(apart) <= SIGMAS_LAST_NS else None
-    values = (
-        host_time_ns,
-        week * WEEK_NS + time_ns,
-        radians(navigation.lat_deg),
-        radians(navigation.lon_deg),
-        navigation.height_m,
-        (navigation.north_mps, navigation.east_mps, navigation.down_mps),
-        radians(navigation.roll_deg),
-        radians(navigation.pitch_deg),
-        radians(navigation.heading_deg),
-        known.position_l if known else UNKNOWN,
-        known.velocity_l if known else UNKNOWN,
-        known.attitude_rad if known else UNKNOWN,
-        navigation.alignment,
-    )
-    return Row(InsSolution, values)
 
 
 class _Parser(FramedParser):
@@ -292,23 +252,41 @@ def _covariance(sigma: gsof.PositionSigma | None) -> np.ndarray[Any, np.dtype[np
 
 # --- POS groups ---
 
+POINTS = ("vehicle", "sensor1", "sensor2")  # of which a POS sends the navigation
+
 
 class PosParser(_Parser):
     """Decodes POS groups; messages (``$MSG``) and all other groups are framed and counted.
 
     Args:
-        settings: ``date_floor`` is the oldest accepted date, ``add_weeks`` is added to all weeks.
+        settings: ``date_floor`` is the oldest accepted date, ``add_weeks`` is added to all weeks, ``solution_of`` is
+            the point whose navigation is returned.
         wanted: the record types to return; None: all.
+
+    Raises:
+        DriverSettingsError: ``solution_of`` is no point of a POS.
     """
 
     def __init__(self, settings: DeviceSettings, *, wanted: tuple[type, ...] | None = None) -> None:
         super().__init__(settings, wanted, (POS, NMEA))
         self._status: tuple[int, int, int] | None = None  # week, time of week (ns) and leap seconds of the last group 3
+        self._imu_told: tuple[int, int] | None = None  # type and rate of the last group 4
+        point = settings.config.get("solution_of") or POINTS[0]
+        if point not in POINTS:
+            raise DriverSettingsError(f"solution_of: got {point!r}, want {', '.join(POINTS[:-1])} or {POINTS[-1]}")
+        self._sensor = SensorSolutions(POINTS.index(point), self.counters) if point != POINTS[0] else None
+
+    def finish(self) -> Items:
+        """Count a sensor's navigation that no navigation of the vehicle followed."""
+        if self._sensor is not None:
+            self._sensor.finish()
+        return []
 
     def _decode(self, frame: Frame) -> Items:
         if frame.kind != POS.name:
             return []
         decoders: dict[str, Callable[[int, bytes], Items]] = {
+            **self._sensor_decoders(),
             "GRP1": self._navigation,
             "GRP2": self._performance,
             "GRP3": self._gnss_status,
@@ -320,6 +298,15 @@ class PosParser(_Parser):
         }
         decode = decoders.get(pos_name(frame.data))
         return [] if decode is None else decode(frame.host_time_ns, frame.data)
+
+    def _sensor_decoders(self) -> dict[str, Callable[[int, bytes], Items]]:
+        if self._sensor is None:
+            return {}
+        index = self._sensor.index
+        return {
+            f"GRP{pos.SENSORS[index].number}": self._sensor_navigation,
+            f"GRP{pos.SENSOR_PERFORMANCES[index].number}": self._sensor_performance,
+        }
 
     def _tag(self, times: pos.TimeDistance) -> TimeTag | None:
         """Return GPS time of a group: of its first or second time, whichever is GPS or UTC time; None, counted, else.
@@ -349,16 +336,42 @@ class PosParser(_Parser):
             self.counters.count_bad("bad_length" if found is None else "not_finite")
             return []
         times, navigation = found
-        if navigation.alignment not in (pos.FULL_NAVIGATION, pos.FINE_ALIGNMENT):
+        if self._sensor is None and navigation.alignment not in (pos.FULL_NAVIGATION, pos.FINE_ALIGNMENT):
             self.counters.errors["ins_not_aligned"] += 1
             return []
+        week, time_ns = self._moment(times)
+        if week is None:
+            return []
+        if self._sensor is not None:
+            return self._sensor.add_vehicle(host_time_ns, time_ns, navigation)
+        return [navigation_row(host_time_ns, week, time_ns, navigation, self._sigmas)]
+
+    def _moment(self, times: pos.TimeDistance) -> tuple[int | None, int]:
+        """Return week and time of week of a solution; no week, counted, where one of them is unknown."""
         tag = self._tag(times)
-        if tag is None:
-            return []
-        if tag.week is None:
+        if tag is not None and tag.week is None:
             self.counters.errors["time_unknown"] += 1
+        return (None, 0) if tag is None else (tag.week, tag.time_ns)
+
+    def _sensor_navigation(self, host_time_ns: int, data: bytes) -> Items:
+        assert self._sensor is not None
+        found = pos.SENSORS[self._sensor.index].decode(data)
+        if found is None or not all(map(isfinite, (*found[0], *found[1][:9]))):
+            self.counters.count_bad("bad_length" if found is None else "not_finite")
             return []
-        return [navigation_row(host_time_ns, tag.week, tag.time_ns, navigation, self._sigmas)]
+        week, time_ns = self._moment(found[0])
+        return [] if week is None else self._sensor.add_sensor(host_time_ns, week, time_ns, found[1])
+
+    def _sensor_performance(self, host_time_ns: int, data: bytes) -> Items:
+        assert self._sensor is not None
+        found = pos.SENSOR_PERFORMANCES[self._sensor.index].decode(data)
+        if found is None or not all(map(isfinite, (*found[0], *found[1]))):
+            self.counters.count_bad("bad_length" if found is None else "not_finite")
+            return []
+        tag = self._tag(found[0])
+        if tag is not None:
+            self._sensor.sigmas = sigmas_of(tag.time_ns, found[1])
+        return []
 
     def _performance(self, host_time_ns: int, data: bytes) -> Items:
         found = pos.PERFORMANCE.decode(data)
@@ -386,8 +399,22 @@ class PosParser(_Parser):
         return [DeviceStatus(host_time_ns, {"solution": solution, **status._asdict()}, message="GRP3")]
 
     def _imu(self, host_time_ns: int, data: bytes) -> Items:
+        """Return the IMU's type where it is new; its increments have no public scale."""
+        found = pos.IMU.decode(data)
+        if found is None:
+            self.counters.count_bad("bad_length")
+            return []
+        head = found[1]
         self.counters.errors["imu_scale_unknown"] += 1
-        return []
+        if head.bad_frames:
+            self.counters.errors["imu_bad_frames"] += head.bad_frames.bit_length()
+        if self._imu_told == (head.imu_type, head.rate):
+            return []
+        self._imu_told = head.imu_type, head.rate
+        status: dict[str, float | int | str | bool] = {"imu_type": head.imu_type, "rate_code": head.rate}
+        if head.rate < len(pos.IMU_RATES_HZ):
+            status["rate_hz"] = pos.IMU_RATES_HZ[head.rate]
+        return [DeviceStatus(host_time_ns, status, message="GRP4")]
 
     def _event(self, host_time_ns: int, data: bytes) -> Items:
         layout = pos.EVENT_1 if pos_name(data) == "GRP5" else pos.EVENT_2
@@ -441,7 +468,7 @@ DRIVERS = (
         kind="gnss",
         transports=STREAM_TRANSPORTS,
         yields=(TimeMessage, InsSolution, EventMark, DeviceStatus),
-        summary="Applanix POS groups (1 2 3 5 6 7 10): INS, PPS and events of a POS AV, LV or MV",
+        summary="Applanix POS groups (1 to 7, 10, 102 to 105): INS, PPS and events of a POS AV, LV or MV",
         make_parser=PosParser,
         make_time_parser=lambda settings: PosParser(settings, wanted=(TimeMessage,)),
         names_edge=NamesEdge.PREVIOUS,

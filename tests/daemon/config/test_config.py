@@ -88,6 +88,7 @@ class TestWholeFile:
             "imu.*.byte_order",
             "imu.*.pps_event",
             "imu.*.altitude",
+            "imu.*.solution_of",
             "scanner.*.geometry.facets",
             "scanner.*.geometry.nutation_deg",
             "scanner.*.geometry.shaft_angle_deg",

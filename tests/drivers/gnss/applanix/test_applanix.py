@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from swath.drivers.gnss.applanix import groups as pos
 from swath.drivers.gnss.applanix import gsof
 from swath.drivers.gnss.applanix.parser import GsofParser, PosParser
-from swath.drivers.parser import DeviceSettings, Parser
+from swath.drivers.parser import DeviceSettings, DriverSettingsError, Parser
 from swath.georef.records import DeviceStatus, EventMark, FixType, InsSolution, Record
 from tests.drivers.builders import of_type, rows_of, times
 from tests.drivers.gnss.builders import fixes
@@ -62,6 +62,12 @@ NAVIGATION = pos.Navigation(
     *(0.5, -0.25, 1.0, 0.1, 0.2, -0.3, 0),
 )
 PERFORMANCE = pos.Performance(0.011, 0.012, 0.023, 0.01, 0.02, 0.03, 0.005, 0.006, 0.02, 0.013, 0.01, 30.0)
+# 2 m ahead of and 1 m below the vehicle's point, mounted 1° right of it; along its own heading and across to starboard
+SENSOR = pos.SensorNavigation(
+    *(47.0 + math.degrees(2 * math.cos(math.radians(331)) / 6.371e6), 8.5, 554.0, 49.97, -1.74, -1.5),
+    *(-3.0, 2.25, 332.0, 12.5, 0.1, 0.5, -0.25, 1.0, 0.1, 0.2, -0.3),
+)
+SENSOR_RMS = pos.SensorPerformance(0.013, 0.014, 0.024, 0.01, 0.03, 0.03, 0.007, 0.008, 0.03)
 STATUS = pos.GnssStatus(0.6, 0.9, 0.0, 65535, WEEK, 18.0, 0.17, 48.5, 16, 0)
 GROUPS = [
     pos.encode_gnss_status(GPS, 7, STATUS, bytes(40)),
@@ -71,14 +77,18 @@ GROUPS = [
     pos.EVENT_1.encode(GPS._replace(time1_s=302_400.125), pos.Event(7)),
     pos.EVENT_2.encode(GPS, pos.Event(8)),
     pos.GENERAL.encode(GPS, pos.General(368, 8_716_288, 4096)),
-    pos.encode_frame(b"$GRP", 4, pos.TIME_DISTANCE.pack(*GPS) + bytes(29)),
-    pos.encode_frame(b"$GRP", 102, pos.TIME_DISTANCE.pack(*GPS) + bytes(96)),
+    pos.IMU.encode(GPS, pos.ImuHead(2, 34, 2, 0)),
+    pos.SENSOR_PERFORMANCES[0].encode(GPS, SENSOR_RMS),
+    pos.SENSORS[0].encode(GPS, SENSOR),
+    pos.SENSORS[1].encode(GPS, SENSOR._replace(height_m=553.0)),
     pos.encode_frame(b"$MSG", 50, bytes(8)),
 ]
 
 
-def parse(make: type[GsofParser] | type[PosParser], *data: bytes) -> tuple[list[Record], Parser]:
-    parser = make(SETTINGS)
+def parse(
+    make: type[GsofParser] | type[PosParser], *data: bytes, settings: DeviceSettings = SETTINGS
+) -> tuple[list[Record], Parser]:
+    parser = make(settings)
     return feed_pieces(parser, data), parser
 
 
@@ -222,8 +232,8 @@ def test_a_group_laid_out_by_hand_is_read() -> None:
 
 def test_lengths_are_those_of_a_recording() -> None:
     """The lengths are of frames of a POS LV in clearpathrobotics/applanix_driver's tests (basic_data_smoke.pcap)."""
-    lengths = {1: 140, 2: 88, 7: 44}
-    layouts = {1: GROUPS[2], 2: GROUPS[1], 7: GROUPS[3]}
+    lengths = {1: 140, 2: 88, 4: 68, 7: 44}
+    layouts = {1: GROUPS[2], 2: GROUPS[1], 4: GROUPS[7], 7: GROUPS[3]}
     assert {number: len(frame) for number, frame in layouts.items()} == lengths
 
 
@@ -237,13 +247,88 @@ def test_events_and_status_are_decoded_and_other_groups_counted() -> None:
         WEEK,
     )
     assert (second.channel, second.valid) == ("EVENT2", True)
-    assert [status.message for status in of_type(records, DeviceStatus)] == ["GRP3", "GRP10"]
+    assert [status.message for status in of_type(records, DeviceStatus)] == ["GRP3", "GRP10", "GRP4"]
     assert parser.counters.messages == {
-        **{f"GRP{number}": 1 for number in (1, 2, 3, 4, 5, 6, 7, 10, 102)},
+        **{f"GRP{number}": 1 for number in (1, 2, 3, 4, 5, 6, 7, 10, 102, 103, 104)},
         "MSG50": 1,
     }
-    assert parser.counters.errors == {"imu_scale_unknown": 1}
+    assert parser.counters.errors == {"imu_scale_unknown": 1, "imu_bad_frames": 2}
     assert parser.counters.bytes_skipped == 0
+
+
+def test_the_type_of_the_imu_is_a_status_and_its_increments_are_counted() -> None:
+    """Bytes 34 to 63 are of a recording of a POS LV in clearpathrobotics/applanix_driver: type 34, 200 Hz."""
+    recorded = bytes.fromhex("43f4ffff9dffffffbbfffffff3ffffff07000000efffffff0022020000")
+    frame = pos.encode_frame(b"$GRP", 4, pos.TIME_DISTANCE.pack(*GPS) + recorded)
+    other = pos.IMU.encode(GPS, pos.ImuHead(4, 34, 9, 0))
+    records, parser = parse_pos(frame, frame, other)
+    assert [status.values for status in of_type(records, DeviceStatus)] == [
+        {"imu_type": 34, "rate_code": 2, "rate_hz": 200},
+        {"imu_type": 34, "rate_code": 9},
+    ]
+    assert parser.counters.errors == {"imu_scale_unknown": 3, "imu_bad_frames": 3}
+
+
+# --- navigation of a sensor ---
+
+
+def parse_sensor(*groups: bytes, number: int = 1) -> tuple[list[Record], Parser]:
+    settings = DeviceSettings("imu/test", {"solution_of": f"sensor{number}"})
+    return parse(PosParser, *groups, settings=settings)
+
+
+def test_a_sensors_groups_make_the_solution_where_the_configuration_asks_for_it() -> None:
+    """Table 29 of the POS MV V5 ICD is packed by hand; SciPy turns its velocity from the heading to north, east."""
+    numbers = struct.pack("<dddfffddddfffffff", *SENSOR)
+    body = struct.pack("<4sHHdddBB", b"$GRP", 102, 128, *GPS) + numbers + b"\0\0"
+    words = sum(struct.unpack(f"<{len(body) // 2}H", body)) + 0x2324
+    frame = body + struct.pack("<H", -words & 0xFFFF) + b"$#"
+    assert len(frame) == 136
+    assert GROUPS[9] == frame
+    records, parser = parse_sensor(*GROUPS)
+    (row,) = rows_of(records, InsSolution)
+    assert parser.counters.errors == {"imu_scale_unknown": 1, "imu_bad_frames": 2}
+    assert row["gps_ns"] == (WEEK * 604_800 + 302_400) * S + S // 4
+    place = (math.degrees(row["lat_rad"]), math.degrees(row["lon_rad"]), row["height_m"])
+    assert place == pytest.approx(SENSOR[:3], abs=1e-12)
+    level = Rotation.from_euler("Z", math.radians(332.0)).apply([49.97, -1.74, -1.5])
+    assert row["velocity_l"] == pytest.approx(level, abs=1e-5)
+    angles = [math.degrees(row[name]) % 360 for name in ("roll_rad", "pitch_rad", "heading_rad")]
+    assert angles == pytest.approx([357.0, 2.25, 332.0])
+    assert row["position_sigma_l"] == pytest.approx([0.013, 0.014, 0.024])
+    assert np.degrees(row["attitude_sigma_rad"]) == pytest.approx([0.007, 0.008, 0.03])
+    turned = Rotation.from_euler("Z", math.radians(332.0)).as_matrix()
+    expected = np.sqrt(np.diag(turned @ np.diag(np.square([0.01, 0.03, 0.03])) @ turned.T))
+    assert row["velocity_sigma_l"] == pytest.approx(expected, rel=1e-5)
+    (second,) = rows_of(parse_sensor(*GROUPS, number=2)[0], InsSolution)
+    assert second["height_m"] == 553.0
+    assert np.isnan(second["position_sigma_l"]).all()
+    (before,) = rows_of(parse_sensor(GROUPS[0], *GROUPS[8:11], GROUPS[2])[0], InsSolution)
+    assert before["height_m"] == 554.0
+
+
+def test_a_sensors_rows_need_the_vehicles_group_its_alignment_and_its_velocity() -> None:
+    status, vehicle, sensor = GROUPS[0], GROUPS[2], GROUPS[9]
+    later = GPS._replace(time1_s=302_400.5)
+    course = SENSOR._replace(along_mps=50.0, across_mps=0.0)  # along the course of 330°, not the heading
+    ahead = SENSOR._replace(lat_deg=47.0004)  # 44 m ahead, in a turn of 14 °/s
+    turning = NAVIGATION._replace(z_rate_dps=14.0)
+    for groups, code in (
+        ((status, vehicle, pos.SENSORS[0].encode(later, SENSOR)), "vehicle_missing"),
+        ((status, sensor, sensor, vehicle), "vehicle_missing"),
+        ((status, pos.NAVIGATION.encode(GPS, NAVIGATION._replace(alignment=2)), sensor), "ins_not_aligned"),
+        ((status, vehicle, pos.SENSORS[0].encode(GPS, course)), "velocity_disagrees"),
+        ((status, vehicle, pos.SENSORS[0].encode(GPS, SENSOR._replace(roll_deg=math.nan))), "not_finite"),
+        ((status, vehicle, pos.encode_frame(b"$GRP", 102, bytes(60))), "bad_length"),
+        ((vehicle, sensor), "time_unknown"),
+        ((status, pos.NAVIGATION.encode(GPS, turning), pos.SENSORS[0].encode(GPS, ahead._replace(across_mps=6.0))), ""),
+    ):
+        records, parser = parse_sensor(*groups)
+        assert set(parser.counters.errors) == ({code} if code else set())
+        rows = sum(len(found.rows) for found in of_type(records, InsSolution))
+        assert rows == (code == "" or (groups[1] is sensor and groups[0] is status))
+    with pytest.raises(DriverSettingsError, match="solution_of: got 'sensor3', want vehicle, sensor1 or sensor2"):
+        parse_sensor(number=3)
 
 
 def test_utc_and_the_weeks_end_become_gps_time() -> None:
@@ -299,5 +384,6 @@ def test_the_fixture_is_what_the_encoder_writes_and_cuts_change_nothing(name: st
 @pytest.mark.parametrize("name", STREAMS)
 def test_every_cut_gives_the_same_and_damage_never_raises(name: str) -> None:
     kind, _ = STREAMS[name]
-    check_stream(lambda: kind(SETTINGS), (FIXTURES / name).read_bytes())
-    check_damage(lambda: kind(SETTINGS), (FIXTURES / name).read_bytes())
+    for settings in (SETTINGS, DeviceSettings("gnss/test", {"solution_of": "sensor1"})):
+        check_stream(partial(kind, settings), (FIXTURES / name).read_bytes())
+        check_damage(partial(kind, settings), (FIXTURES / name).read_bytes())
