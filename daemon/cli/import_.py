@@ -35,7 +35,9 @@ def command(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Directory for the log.")],
     files: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="FILE…", help="pcap, pcapng or candump -L files, or the folder of an export."),
+        typer.Argument(
+            metavar="FILE…", help="pcap, pcapng, candump -L, lvx or lvx2 files, or the folder of an export."
+        ),
     ] = None,
     source: Annotated[
         list[str] | None,
@@ -43,9 +45,7 @@ def command(
     ] = None,
     start: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="[SOURCE=]TIME", help="Start time of a serial file without times, such as 2026-11-21T10:15:00Z."
-        ),
+        typer.Option(metavar="[SOURCE=]TIME", help="Start time of a file without times, such as 2026-11-21T10:15:00Z."),
     ] = None,
     baud: Annotated[
         list[str] | None,
@@ -56,7 +56,7 @@ def command(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """Make a log from captures of tcpdump, candump or str2str, or from the files of `swath export`.
+    """Make a log from captures of tcpdump, candump, str2str or Livox Viewer, or from the files of `swath export`.
 
     CONFIG's UDP ports and CAN interfaces assign the units of pcap files and candump logs to devices; a serial stream
     needs --source. Exit code 4 when a capture is damaged, 1 when a capture holds nothing from CONFIG's devices.
@@ -166,6 +166,8 @@ def _print(report: ImportReport, captures: list[Capture]) -> None:
             most = ", ".join(f"{what} ({count})" for what, count in capture.passed.most_common(5))
             parts.append(f"{capture.passed.total()} from unknown devices: {most}")
         print(one_line(f"{capture.path}: {capture.kind}, {', '.join(parts)}"))
+        for head in capture.heads.values():
+            print(one_line(f"  {head.words()}"))
     for path in report.paths:
         print(path)
 

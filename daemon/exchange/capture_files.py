@@ -15,7 +15,17 @@ from swath.daemon.exchange.export import MANIFEST
 from swath.daemon.exchange.routes import Port, Routes
 from swath.daemon.exchange.sidecar import SUFFIX
 from swath.daemon.log.format import LogError, safe_attachment_path
-from swath.drivers.captures.opening import BareTime, is_candump, is_pcap, is_shown_candump, read_beginning
+from swath.drivers.captures.opening import (
+    BareTime,
+    LvxHead,
+    is_candump,
+    is_lvx,
+    is_pcap,
+    is_shown_candump,
+    read_beginning,
+    read_lvx_heads,
+    tells_time,
+)
 from swath.drivers.transports.base import TransportError
 
 _LOOKED_AT_BYTES = 65_536
@@ -86,6 +96,8 @@ def _named(routes: Routes, text: str) -> list[Capture]:
     path = Path(file)
     port = _port(routes, source, f"--source {text}")
     kind = _kind(read_beginning(path, _LOOKED_AT_BYTES)[0])
+    if kind == "lvx":
+        return [_named_heads(path, port, selector)]
     wanted = _KIND_OF_PORT[port.kind]
     if (kind == "pcap") != (wanted == "pcap"):
         forms = {
@@ -122,15 +134,58 @@ def _found(routes: Routes, path: Path) -> list[Capture]:
         raise UserError(
             f"{path}: neither pcap nor candump -L; if it holds the bytes of a device, use --source kind/name={path}"
         )
+    if kind == "lvx":
+        return [_found_heads(routes, path)]
     if routes.described(kind) == "none":
         raise UserError(f"{path}: the configuration has no {'UDP port' if kind == 'pcap' else 'CAN bus'} for it")
     return [Capture(path, kind)]
 
 
+def _named_heads(path: Path, port: Port, code: str) -> Capture:
+    """Return a file of Livox Viewer whose head, or the one with this code, is the source that the user named."""
+    heads = _heads(path)
+    chosen = [head for head in heads.values() if not code or head.code == code]
+    if port.kind != "udp" or not port.source.startswith("scanner/"):
+        raise UserError(f"{path}: is a file of Livox Viewer, but {port.source} is not a scanner by UDP")
+    if len(chosen) != 1:
+        raise UserError(
+            f"{path}: holds {_listed(heads)}; give --source {port.source}:CODE={path}, CODE being one of them"
+        )
+    if chosen[0].protocol not in ("", port.protocol):
+        raise UserError(
+            f'{path}: {_listed(heads)} has protocol "{chosen[0].protocol}", but {port.source} "{port.protocol}"; '
+            "want a source of that protocol"
+        )
+    return Capture(path, "lvx", port, code or None, heads=heads, head_ports={chosen[0].code: port})
+
+
+def _found_heads(routes: Routes, path: Path) -> Capture:
+    """Return a file of Livox Viewer whose heads are found by serial number or protocol."""
+    heads = _heads(path)
+    ports = routes.of_heads(heads.values())
+    if not ports:
+        raise UserError(
+            f"{path}: holds {_listed(heads)}, but the configuration has {routes.described('lvx')}; "
+            f"give --source scanner/NAME:CODE={path}, or serial and protocol in [scanner.NAME]"
+        )
+    return Capture(path, "lvx", heads=heads, head_ports=ports)
+
+
+def _heads(path: Path) -> dict[str, LvxHead]:
+    return {head.code: head for head in read_lvx_heads(path).heads.values()}
+
+
+def _listed(heads: Mapping[str, LvxHead]) -> str:
+    named = [f"{head.code} ({head.model}, {head.protocol or 'no protocol'})" for head in heads.values()]
+    return ", ".join(named) or "no head"
+
+
 def _kind(head: bytes) -> str:
-    """Recognise a file by its beginning: pcap or candump, else the bytes of a serial line."""
+    """Recognise a file by its beginning: pcap, lvx or candump, else the bytes of a serial line."""
     if is_pcap(head):
         return "pcap"
+    if is_lvx(head):
+        return "lvx"
     return "candump" if any(map(is_candump, _first_lines(head))) else "serial"
 
 
@@ -141,6 +196,8 @@ def _first_lines(head: bytes) -> list[str]:
 def _settle(capture: Capture, given: ImportOptions) -> None:
     """Apply the command line's options to a file: its times, and whether copies stay."""
     capture.keep_copies = given.keep_copies
+    if capture.kind == "lvx":
+        _settle_heads(capture, given)
     if capture.kind != "serial" or has_times(capture.path):
         return
     assert capture.port is not None
@@ -155,6 +212,16 @@ def _settle(capture: Capture, given: ImportOptions) -> None:
     parity = options.get("parity", "N") != "N"
     bits = 1 + int(options.get("bytesize", 8)) + parity + float(options.get("stopbits", 1))
     capture.time = BareTime(start_ns, baud, bits)
+
+
+def _settle_heads(capture: Capture, given: ImportOptions) -> None:
+    """Find the time at which a file of Livox Viewer begins, where its packages have no UTC."""
+    if tells_time(capture.path):
+        return
+    started = [given.start_ns[port.source] for port in capture.head_ports.values() if port.source in given.start_ns]
+    capture.start_ns = started[0] if started else given.start_ns.get("")
+    if capture.start_ns is None:
+        raise UserError(f"{capture.path}: its head was not set to UTC, and the file has no other times; give --start")
 
 
 # --- the folder of an export ----------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,9 +21,11 @@ from swath.drivers.captures.base import (
 )
 from swath.drivers.captures.opening import (
     BareTime,
+    LvxHead,
     chunk_table,
     read_bare,
     read_candump,
+    read_lvx,
     read_pcap,
     read_serial,
     read_tagged,
@@ -46,10 +48,12 @@ class Capture:
     """A file to import, its kind, and counts of the units found in it.
 
     Attributes:
-        kind: "pcap", "candump", "serial" or "pps".
+        kind: "pcap", "candump", "serial", "lvx" or "pps".
         port: the port whose units it holds; None if the units identify their ports themselves.
-        selector: the only CAN interface, or UDP port number, whose units are used.
+        selector: the only CAN interface, UDP port number, or head of an lvx file, whose units are used.
         time: timing of the bytes of a serial file without times.
+        heads: of an lvx file, by code. head_ports: the ports of those that are used, by code. start_ns: of an lvx file
+            whose packages have no UTC, the time at which it begins.
         units: number used, by source. passed: number that belong to no device, by port or interface.
     """
 
@@ -59,6 +63,9 @@ class Capture:
     selector: str | None = None
     time: BareTime | None = None
     keep_copies: bool = False
+    heads: Mapping[str, LvxHead] = field(default_factory=dict)
+    head_ports: Mapping[str, Port] = field(default_factory=dict)
+    start_ns: int | None = None
     tally: CaptureTally = field(default_factory=CaptureTally)
     units: Counter[str] = field(default_factory=Counter)
     passed: Counter[str] = field(default_factory=Counter)
@@ -82,6 +89,8 @@ class Capture:
             return complete(units, self.path)
         if self.kind == "candump":
             return complete(read_candump(self.path, tally=self.tally), self.path, within_ns=1000)
+        if self.kind == "lvx":
+            return read_lvx(self.path, self.start_ns, self.tally)
         if self.kind == "pps":
             assert self.port is not None
             return complete(_edges(self.path, self.port.edge, self.tally), self.path)
@@ -95,10 +104,12 @@ class Capture:
         return read_bare(self.path, self.time, self.tally)
 
     def _port_of(self, unit: CapturedUnit, routes: Routes) -> Port | None:
-        if self.port is not None and self.selector is None:
+        if self.port is not None and self.selector is None and self.kind != "lvx":
             return self.port
         destination = str(unit.destination[1]) if unit.destination is not None else unit.channel
-        if self.port is not None:
+        if self.kind == "lvx":
+            found = self.head_ports.get(unit.channel)
+        elif self.port is not None:
             found = self.port if destination == self.selector else None
         else:
             found = routes.of_datagram(unit) if self.kind == "pcap" else routes.of_frame(unit)
@@ -113,10 +124,17 @@ class Capture:
             "kind": self.kind,
             "units": dict(self.units),
             "of_no_device": dict(self.passed),
+            "heads": [_plain_head(head) for head in self.heads.values()],
             "passed_over": {what: count for what, count in self.tally.passed.items() if count},
             "damage": self.tally.damage,
             "first_damage": self.tally.first_damage or None,
         }
+
+
+def _plain_head(head: LvxHead) -> dict[str, Any]:
+    angles, place = ("roll_deg", "pitch_deg", "yaw_deg"), ("x_m", "y_m", "z_m")
+    claimed = dict(zip((*angles, *place), (*head.angles_deg, *head.place_m), strict=True))
+    return {"code": head.code, "model": head.model, "protocol": head.protocol or None, "used": head.enabled} | claimed
 
 
 def tag_of(path: Path) -> Path:

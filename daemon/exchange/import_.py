@@ -148,7 +148,8 @@ class ReadSoFar:
 
 def _note(log: ImportLog, capture: Capture) -> None:
     counts = ", ".join(f"{count} units of {source}" for source, count in capture.units.items()) or "no units"
-    log.event(Severity.INFO, "capture_imported", f"{capture.path.name}: {counts}")
+    claims = "".join(f"; {head.words()}" for head in capture.heads.values())
+    log.event(Severity.INFO, "capture_imported", f"{capture.path.name}: {counts}{claims}")
     if capture.tally.damage:
         text = (
             f"{capture.path.name} is damaged in {capture.tally.damage} places; the first: {capture.tally.first_damage}"

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 from swath.daemon.config import Config
 from swath.daemon.log.format import ChannelSpec
 from swath.daemon.log.wires import Wire, make_wire
 from swath.drivers.captures.base import CapturedUnit
+from swath.drivers.captures.opening import LvxHead
 from swath.drivers.transports.spec import TransportSpec
 
 
@@ -22,6 +23,7 @@ class Port:
         spec: its transport; None for PPS.
         channel: its channel in the log, without a sender.
         edge: of a PPS source, the edge that marks the second.
+        serial: of a scanner, the serial number that the configuration gives.
     """
 
     source: str
@@ -29,6 +31,17 @@ class Port:
     spec: TransportSpec | None
     channel: ChannelSpec
     edge: str = ""
+    serial: str = ""
+
+    @property
+    def protocol(self) -> str:
+        """The protocol of its device; empty for PPS."""
+        return self.channel.metadata.get("protocol", "")
+
+    @property
+    def is_aux(self) -> bool:
+        """True for a head's second port."""
+        return self.source.endswith("/aux")
 
     @property
     def options(self) -> dict[str, str]:
@@ -36,9 +49,9 @@ class Port:
         return self.spec.options if self.spec is not None else {}
 
 
-def _port(wire: Wire, spec: TransportSpec) -> Port:
+def _port(wire: Wire, spec: TransportSpec, serial: str) -> Port:
     channel = ChannelSpec(wire.topic, wire.encoding, wire.metadata, None, wire.chunk_class)
-    return Port(wire.source, spec.kind, spec, channel)
+    return Port(wire.source, spec.kind, spec, channel, serial=serial)
 
 
 def _ports(config: Config) -> Iterator[Port]:
@@ -48,7 +61,8 @@ def _ports(config: Config) -> Iterator[Port]:
     for device in config.devices():
         for spec, suffix in ((device.transport, ""), (device.auxiliary, "/aux")):
             if spec is not None and spec.carrier is None:
-                yield _port(make_wire(device, spec, suffix), spec)
+                serial = str(device.settings.config.get("serial", ""))
+                yield _port(make_wire(device, spec, suffix), spec, serial)
 
 
 @dataclass(slots=True)
@@ -91,8 +105,34 @@ class Routes:
         """Return the port of a CAN frame by its interface."""
         return self._can.get(unit.channel)
 
+    def of_heads(self, heads: Iterable[LvxHead]) -> dict[str, Port]:
+        """Return the scanners, by code, that are the heads of a file: each is the one with the head's serial number, or
+        the only one of its protocol where the file has only one head of it.
+        """
+        scanners, found, others = self._scanners(), dict[str, Port](), list[LvxHead]()
+        for head in heads:
+            named = [port for port in scanners if port.serial and head.code.upper().startswith(port.serial.upper())]
+            if len(named) == 1:
+                found[head.code] = named[0]
+            elif not named:
+                others.append(head)
+        for head in others:
+            free = [port for port in scanners if not port.serial and port.protocol == head.protocol]
+            if len(free) == 1 and sum(other.protocol == head.protocol for other in others) == 1:
+                found[head.code] = free[0]
+        return found
+
+    def _scanners(self) -> list[Port]:
+        ports = self.ports.values()
+        return [port for port in ports if port.kind == "udp" and port.source.startswith("scanner/") and not port.is_aux]
+
     def described(self, kind: str) -> str:
-        """List the configured ports or buses for a message."""
+        """List the configured ports, buses or scanners for a message."""
+        if kind == "lvx":
+            named = [
+                f"{one.source} ({one.protocol}{f', {one.serial}' if one.serial else ''})" for one in self._scanners()
+            ]
+            return ", ".join(named) or "none"
         if kind == "pcap":
             return ", ".join(f"{number} ({ports[0].source})" for number, ports in self._udp.items()) or "none"
         return ", ".join(f"{name} ({port.source if port else 'of two'})" for name, port in self._can.items()) or "none"

@@ -9,10 +9,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from io import BufferedIOBase
 from pathlib import Path
+from typing import TypeVar
 
 from swath.drivers.transports.base import TransportError
 
 Address = tuple[str, int]
+UnitT = TypeVar("UnitT")
 LATEST_NS = 2**63 - 1
 MAX_LINE_BYTES = 4096  # the longest valid line of a text format here has some 300
 
@@ -66,7 +68,7 @@ def report(tally: CaptureTally | None, text: str) -> None:
     tally.damaged(text)
 
 
-def until_damage(units: Iterator[CapturedUnit], tally: CaptureTally | None) -> Iterator[CapturedUnit]:
+def until_damage(units: Iterator[UnitT], tally: CaptureTally | None) -> Iterator[UnitT]:
     """Yield units up to the place after which the file cannot be read."""
     try:
         yield from units

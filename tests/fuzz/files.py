@@ -11,8 +11,10 @@ from pathlib import Path
 
 from swath.daemon.config import load_config
 from swath.daemon.errors import UserError
-from swath.drivers.captures.opening import CaptureTally, read_candump, read_pcap, read_serial
+from swath.drivers.captures.opening import CaptureTally, read_candump, read_lvx, read_pcap, read_serial, tells_time
 from swath.drivers.transports.base import TransportError
+from tests.drivers.livox_cases import FILES
+from tests.drivers.lvx_files import FileHead, lvx1_package, lvx2_package, lvx_file
 from tests.drivers.recordings import FIXTURES
 from tests.fuzz.engine import FindingError, Target
 from tests.fuzz.mutation import damage
@@ -51,6 +53,7 @@ def file_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
     """Yield the targets of capture readers, each with its own kind of file, and of the configuration with its files."""
     yield "pcap", lambda: _captures("pcap", _pcaps(), read_pcap)
     yield "candump", lambda: _captures("candump", _heads("nmea2000/*.log.gz", "canmod-gps/*.log.gz"), read_candump)
+    yield "lvx", lambda: _captures("lvx", _lvxs(), _read_lvx)
     yield "serial", lambda: _captures("serial", [_serial_case()], _read_serial)
     yield "config", _configuration
 
@@ -64,6 +67,19 @@ def _pcaps() -> list[bytes]:
     """Return the beginnings of captures, one of them gzipped and cut off."""
     found = _heads("*/*.pcap.gz")
     return [*found, gzip.compress(found[0])[:-20]]
+
+
+def _lvxs() -> list[bytes]:
+    """Return files of Livox Viewer of both kinds, one of them gzipped and cut off."""
+    heads = {"avia": FileHead("3JEDHB300100641", 0, 7), "mid360": FileHead("47MDK4A0020123", 7, 9)}
+    first = [[lvx1_package(0, unit)] for unit in sorted(FILES["avia"](), key=len)[:12]]
+    second = [[lvx2_package(7, unit)] for unit in sorted(FILES["mid360"](), key=len)[:5]]
+    found = [lvx_file(1, [heads["avia"]], first), lvx_file(2, [heads["mid360"]], second)]
+    return [*found, gzip.compress(found[1])[:-20]]
+
+
+def _read_lvx(path: Path, tally: CaptureTally | None) -> Iterator[object]:
+    return read_lvx(path, None if tells_time(path) else 1_800_000_000_000_000_000, tally)
 
 
 def _captures(name: str, seeds: list[bytes], read: Callable[..., Iterator[object]]) -> Target:

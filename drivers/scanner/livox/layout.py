@@ -133,20 +133,21 @@ class LivoxHead:
     Attributes:
         name: of the models.
         sdk: 1 or 2.
-        pulses_hz: pulses a second of SDK 1, whose packets do not contain them.
+        pulses_hz: pulses a second by the data sheet. Packets of SDK 1, and files of Livox Viewer 2, do not tell when a
+            pulse was fired.
         lines: lasers that fire in turn; a pulse's place in its packet gives its own (lds.h, comm.h of the ROS drivers).
     """
 
     name: str
     sdk: int
     lines: int
-    pulses_hz: int = 0
+    pulses_hz: int
 
 
 MID40 = LivoxHead("Mid-40, Mid-70", 1, 1, 100_000)
 AVIA = LivoxHead("Avia, Horizon, Tele-15", 1, 6, 240_000)
-MID360 = LivoxHead("Mid-360", 2, 4)
-HAP = LivoxHead("HAP", 2, 6)
+MID360 = LivoxHead("Mid-360", 2, 4, 200_000)
+HAP = LivoxHead("HAP", 2, 6, 452_000)
 
 
 def utc_bytes(when: dt.datetime) -> bytes:
