@@ -33,10 +33,17 @@ from swath.drivers.imu.canmod_gps import CanmodGpsParser
 from swath.drivers.imu.dbc.parser import DbcParser
 from swath.drivers.imu.vectornav import wire
 from swath.drivers.parser import DeviceSettings, Parser, ParserCounters
-from swath.drivers.scanner.hesai.heads import MODE_FIRST_LAST_STRONGEST, HesaiHead
+from swath.drivers.scanner.hesai.at128 import AT128
+from swath.drivers.scanner.hesai.heads import (
+    MODE_FIRST_LAST_STRONGEST,
+    MODE_LAST_STRONGEST,
+    MODE_STRONGEST,
+    HesaiHead,
+    echoes_of,
+)
 from swath.drivers.scanner.hesai.models import QT64, QT128, XT16, XT32, XT32M2X
 from swath.drivers.scanner.hesai.pandar import PANDAR40P, PANDAR64, PANDAR128
-from swath.drivers.scanner.hesai.parser import HesaiParser, encode_point_packet, with_checksums
+from swath.drivers.scanner.hesai.parser import HesaiParser, MirrorParser, encode_point_packet, with_checksums
 from swath.drivers.scanner.livox.layout import AVIA, POINTS_1, PTP, encode_packet_1
 from swath.drivers.scanner.livox.parser import LivoxParser
 from swath.drivers.scanner.ouster.layout import LidarLayout
@@ -225,15 +232,21 @@ def measure_hesai(repeats: int) -> Iterator[Figure]:
             packets["blocks"]["azimuth"] = np.repeat(packets["blocks"]["azimuth"][:, ::3], 3, axis=1)
             yield hesai_figure("XT32M2X, three returns", head, units, repeats)
     for head in (PANDAR40P, PANDAR64, PANDAR128):
-        yield hesai_figure(f"{head.name}, strongest return", head, pandar_units(head), repeats)
+        yield hesai_figure(f"{head.name}, strongest return", head, made_units(head, MODE_STRONGEST), repeats)
+    file = gzip.decompress((FIXTURES / "hesai" / "at128.dat.gz").read_bytes())
+    settings = DeviceSettings("scanner/bench", {}, {"geometry": file})
+    for name, mode in (("AT128, strongest return", MODE_STRONGEST), ("AT128, dual return", MODE_LAST_STRONGEST)):
+        make = partial(MirrorParser, head=AT128)
+        yield head_figure(name, make, settings, made_units(AT128, mode), 10e6, repeats, AIMED_RETURN_DTYPE)
 
 
-def pandar_units(head: HesaiHead) -> ByteRows:
-    """Make 3600 packets of a head without recording in single return, 70 % of the places used."""
+def made_units(head: HesaiHead, mode: int) -> ByteRows:
+    """Make 3600 packets of a head without recording, 70 % of the places used."""
     random, shape = np.random.default_rng(1), (head.blocks, head.channels)
     ranges = random.integers(500, 30_000, shape) * (random.random(shape) < 0.7)
     when = dt.datetime(2026, 4, 15, 10, tzinfo=dt.UTC)
-    one = encode_point_packet(when, np.arange(head.blocks) * 20, ranges, 50, head=head, tail={"operation": 2})
+    azimuth = 7000 + 20 * (np.arange(head.blocks) // echoes_of(mode))
+    one = encode_point_packet(when, azimuth, ranges, 50, mode, head=head, tail={"operation": 2})
     units = np.tile(np.frombuffer(one, dtype=np.uint8), (3600, 1))
     dtype = next(layout.dtype for length, layout in head.layouts().items() if length == len(one))
     units.view(dtype)["sequence"][:, 0] = np.arange(1, len(units) + 1)

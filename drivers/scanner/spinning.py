@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -97,14 +97,19 @@ def returns_of_packets(
         firings_of: makes the firings of a slice of the packets.
         fill: writes their rows.
     """
-    edges = [0, *(np.flatnonzero(mode[1:] != mode[:-1]) + 1).tolist(), len(mode)]
     table = returns_table(len(mode) * most)
     filled = 0
+    for part in parts_of(mode, most):
+        filled += fill(firings_of(part).slots(), table[filled:])
+    return table[:filled]
+
+
+def parts_of(mode: NDArray[np.integer], most: int) -> Iterator[slice]:
+    """Divide packets into blocks of one return mode; see `returns_of_packets`."""
+    edges = [0, *(np.flatnonzero(mode[1:] != mode[:-1]) + 1).tolist(), len(mode)]
     for start, stop in pairwise(edges):
         for at in range(start, stop, BLOCK_SLOTS // most):
-            part = slice(at, min(at + BLOCK_SLOTS // most, stop))
-            filled += fill(firings_of(part).slots(), table[filled:])
-    return table[:filled]
+            yield slice(at, min(at + BLOCK_SLOTS // most, stop))
 
 
 def single_content(returns: StructArray) -> StructArray:

@@ -124,7 +124,7 @@ def test_only_drivers_that_declare_needs_refuse_empty_settings(driver: Driver) -
         ("gnss", "nema", "nmea?"),
         ("imu", "ellipse", "sbg-ellipse?"),
         ("imu", "xsens", "xsens-mti or xsens-xbus?"),
-        ("scanner", "hesai", "did you mean hesai-ot128 or hesai-pandar128 or "),
+        ("scanner", "hesai", "did you mean hesai-at128 or hesai-ot128 or "),
         ("gnss", "-", "there are: "),
         ("gnss", "qqq", "there are: "),
         ("scanner", "vlp-16\0\n", "velodyne-vlp16?"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import random
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -10,6 +12,7 @@ from swath.drivers.driver import Driver, find_driver
 from swath.drivers.parser import DeviceKind, DeviceSettings, DriverSettingsError
 from tests.drivers.recordings import FIXTURES
 from tests.fuzz.engine import Target
+from tests.fuzz.mutation import damage
 from tests.fuzz.recordings import settings_of
 from tests.fuzz.texts import NUMBERS, OF_CSV, OF_JSON, changed_text, told
 
@@ -38,13 +41,27 @@ def device_file_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
     """Return the targets of device files, each with the drivers that read such a file."""
     hesai: Protocols = (("scanner", "hesai-xt32"), ("scanner", "hesai-qt64"), ("scanner", "hesai-qt128"))
     yield "geometry-hesai", partial(_files, "geometry-hesai", hesai)
+    mirrors: Protocols = (("scanner", "hesai-at128"),)
+    yield "geometry-hesai-at128", partial(_files, "geometry-hesai-at128", mirrors, _changed_and_sealed)
     yield "geometry-ouster", partial(_files, "geometry-ouster", (("scanner", "ouster"),))
     heads: Protocols = (("scanner", "velodyne-vlp16"), ("scanner", "velodyne-vlp32c"))
     yield "geometry-velodyne", partial(_files, "geometry-velodyne", heads)
     yield "dbc", partial(_files, "dbc", (("imu", "dbc"),))
 
 
-def _files(name: str, protocols: Protocols) -> Target:
+def _changed(rng: random.Random, base: bytes) -> bytes:
+    return changed_text(rng, base, WORDS)
+
+
+def _changed_and_sealed(rng: random.Random, base: bytes) -> bytes:
+    """Change a file that ends in its SHA-256, and usually write the new one."""
+    changed = damage(rng, base)
+    if rng.random() < 0.2 or len(changed) < 32:
+        return changed
+    return changed[:-32] + hashlib.sha256(changed[:-32]).digest()
+
+
+def _files(name: str, protocols: Protocols, changed: Callable[[random.Random, bytes], bytes] = _changed) -> Target:
     drivers = [find_driver(kind, protocol) for kind, protocol in protocols]
     examples = [(driver, settings_of(driver)) for driver in drivers]
     seeds = [content for _, found in examples for one in found for content in one.files.values()]
@@ -57,7 +74,7 @@ def _files(name: str, protocols: Protocols) -> Target:
             seen |= {words[:24] for words in made}
         return iter(seen)
 
-    return Target(name, seeds or _of_velodyne(), lambda rng, base: changed_text(rng, base, WORDS), run)
+    return Target(name, seeds or _of_velodyne(), changed, run)
 
 
 def _made(driver: Driver, settings: DeviceSettings) -> Iterator[str]:

@@ -65,6 +65,7 @@ HEADER: Fields = (
 )
 BLOCK: Fields = (("azimuth", "<u2"),)
 SOP, BLOCK_SOP = 0xFFEE, 0xEEFF
+NO_BEAMS = beam_table([])
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,8 @@ class HesaiHead:
         stamped_round: whether the packet's time is that of its first or of its last round.
         start_ns: time from a round's stamp to the reading of its azimuth.
         offset_ns: (states, channels) firing times after the reading of the azimuth.
-        beams: design values; a device's own values are in its angle correction file.
+        beams: design values; a device's own values are in its angle correction file. Empty: its directions depend on
+            the angle of mirrors, and only that file gives them.
         channel_bytes: bytes of a return without those that the flags add.
         has_crc: whether a CRC follows the body, and one the tail.
         checks_crc: whether it is known which CRC that is, so that packets with a wrong one are refused.
@@ -95,6 +97,8 @@ class HesaiHead:
         header, block: fields of the header and at the beginning of a block; empty where the packet has no header.
         year_base: year from which the date counts; from 1900, a year byte of 0 says that seconds since 1970 follow.
         least_range: smaller raw ranges are codes of the head, not distances.
+        duty: part of the time in which the head fires.
+        older: the same model with the earlier protocol, which it may send as well.
     """
 
     name: str
@@ -107,7 +111,7 @@ class HesaiHead:
     stamped_round: int
     start_ns: int
     offset_ns: Int64Array
-    beams: BeamTable
+    beams: BeamTable = NO_BEAMS
     protocol_minor: int = 1
     optional: int = 0
     channel_bytes: int = 4
@@ -122,6 +126,8 @@ class HesaiHead:
     block: Fields = BLOCK
     year_base: int = 1900
     least_range: int = 1
+    duty: float = 1.0
+    older: HesaiHead | None = None
 
     def packet_dtype(self, flags: int | None = None) -> np.dtype[np.void]:
         """Return the dtype of a point cloud packet with these flags (None: the usual ones)."""
@@ -159,9 +165,9 @@ class HesaiHead:
         for chosen in range(1 << len(bits)):
             flags = self.flags & ~self.optional | sum(bit for at, bit in enumerate(bits) if chosen >> at & 1)
             dtype = self.packet_dtype(flags)
-            layout = found.setdefault(dtype.itemsize, Layout(dtype, np.zeros(256, dtype=np.bool_)))
+            layout = found.setdefault(dtype.itemsize, Layout(self, dtype, np.zeros(256, dtype=np.bool_)))
             layout.fits[(np.arange(256) & known) == flags] = True
-        return found
+        return found if self.older is None else self.older.layouts() | found
 
     def round_start_ns(self, rounds: int) -> Int64Array:
         """Return (rounds,) times from the packet's time to the reading of each round's azimuth."""
@@ -193,7 +199,7 @@ class HesaiHead:
     def bytes_per_s(self) -> float:
         """The most that the head sends: its usual packets in the return mode with the fewest rounds in a packet."""
         rounds = self.blocks // max(map(echoes_of, self.modes))
-        return 1e9 * self.packet_dtype().itemsize / (rounds * self.round_ns)
+        return self.duty * 1e9 * self.packet_dtype().itemsize / (rounds * self.round_ns)
 
     def last_ns(self, mode: int) -> int:
         """Return the time from the packet's time to its last firing."""
@@ -205,10 +211,12 @@ class Layout:
     """Layout of packets of one length.
 
     Attributes:
+        head: the model with the protocol of these packets.
         dtype: the packet.
         fits: (256,) True for flags of the header with which a packet has this layout.
     """
 
+    head: HesaiHead
     dtype: np.dtype[np.void]
     fits: BoolArray
 
