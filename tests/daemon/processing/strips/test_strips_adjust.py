@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -16,9 +17,7 @@ from pyproj import Transformer
 from swath.daemon.cli.main import run_app
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.carried_verdict import ADJUSTMENT, file_verdicts
-from swath.daemon.processing.flights.read import GeorefOptions
-from swath.daemon.processing.flights.trajectory_choice import TrajectoryOptions
-from swath.daemon.processing.setup.setup import Options
+from swath.daemon.processing.strips import adjust as strip_adjust
 from swath.daemon.processing.strips import adjust_products as strip_adjust_products
 from swath.daemon.processing.strips.adjust import AdjustOptions, StripsCorrected, correct_strips
 from swath.daemon.processing.strips.adjust_products import write_adjustment
@@ -67,12 +66,32 @@ def arguments(made: Made, trajectory: Path, output: Path, *more: str) -> list[st
     return ["strips", str(made.flown.log), *given, *calibration, "--adjust", str(output), *more]
 
 
+Done = tuple[AdjustOptions, StripsCorrected]
+
+
 @pytest.fixture(scope="module")
-def adjusted(made: Made, lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder written by the command."""
+def adjusted_once(made: Made, lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Done]:
+    """Return the folder written by the command, and its outcome before it was written."""
     folder = tmp_path_factory.mktemp("adjusted") / "new" / "folder"
-    assert run_app(arguments(made, lifted, folder)) == 0
-    return folder
+    outcomes: list[Done] = []
+
+    def kept(request: AdjustOptions, returns: Path, tell: Any) -> StripsCorrected:
+        outcomes.append((request, correct_strips(request, returns, tell)))
+        return outcomes[-1][1]
+
+    with patch.object(strip_adjust, "correct_strips", kept):
+        assert run_app(arguments(made, lifted, folder)) == 0
+    return folder, outcomes[0]
+
+
+@pytest.fixture
+def adjusted(adjusted_once: tuple[Path, Done]) -> Path:
+    return adjusted_once[0]
+
+
+@pytest.fixture
+def done(adjusted_once: tuple[Path, Done]) -> Done:
+    return adjusted_once[1]
 
 
 def record_of(folder: Path) -> Any:
@@ -122,14 +141,23 @@ def test_no_calibration_is_written(made: Made, adjusted: Path) -> None:
     assert any("the datum is not determined" in note for note in record["notes"])
 
 
-def test_the_calibration_is_unchanged_and_the_table_lists_the_corrections(
-    made: Made, lifted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_the_corrected_trajectory_is_readable_and_needs_no_correction(
+    made: Made, adjusted: Path, tmp_path: Path
 ) -> None:
-    file = made.flown.folder / "left.true.toml"
-    was = file.read_bytes(), file.stat().st_mtime_ns
-    assert run_app(arguments(made, lifted, tmp_path / "out", "--strip-model", "constant")) == 0
-    assert (file.read_bytes(), file.stat().st_mtime_ns) == was
-    told = capsys.readouterr().out
+    for suffix in (".csv", ".sbet"):
+        path = trajectory_of(adjusted, suffix)
+        first = int(made.trajectory.time_ns[0])
+        read = read_trajectory(path.read_bytes(), path.name, span_ns=(first, first + 1))
+        times = made.flight.swaths[LIFTED].time_ns
+        along = (read.time_ns > times[0]) & (read.time_ns < times[-1])
+        heights_m, true_m = (one.geodetic()[2][along] for one in (read, made.trajectory))
+        np.testing.assert_allclose(heights_m, true_m, rtol=0.0, atol=0.015)
+    assert run_app(arguments(made, path, tmp_path / "again")) == 0
+    assert {strip["model"] for strip in record_of(tmp_path / "again")["strips"]} == {"none"}
+
+
+def check_table(made: Made, told: str) -> None:
+    """Check what is printed about the corrections of a lifted strip by a constant."""
     assert f"no calibration; held: left {made.truth.id}" in told
     assert "note: model of all strips: constant\n" in told
     assert "file tells no sigmas, and no sigma here contains its errors" in told  # the true calibration's
@@ -137,29 +165,17 @@ def test_the_calibration_is_unchanged_and_the_table_lists_the_corrections(
     assert "constant" in row
     assert "not determined" in row  # over almost level ground its horizontal shift is not determined
     assert "→" in row
-    assert str(tmp_path / "out" / ADJUSTMENT) in told
-
-
-@pytest.mark.parametrize("suffix", [".csv", ".sbet"])
-def test_the_corrected_trajectory_is_readable_and_needs_no_correction(
-    made: Made, adjusted: Path, tmp_path: Path, suffix: str
-) -> None:
-    path = trajectory_of(adjusted, suffix)
-    first = int(made.trajectory.time_ns[0])
-    read = read_trajectory(path.read_bytes(), path.name, span_ns=(first, first + 1))
-    times = made.flight.swaths[LIFTED].time_ns
-    along = (read.time_ns > times[0]) & (read.time_ns < times[-1])
-    heights_m, true_m = (one.geodetic()[2][along] for one in (read, made.trajectory))
-    np.testing.assert_allclose(heights_m, true_m, rtol=0.0, atol=0.015)
-    assert run_app(arguments(made, path, tmp_path / "again")) == 0
-    assert {strip["model"] for strip in record_of(tmp_path / "again")["strips"]} == {"none"}
 
 
 def test_an_unusable_trajectory_is_reported_first_and_stays_unusable(
     made: Made, lifted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The exit code is 1; the files are written, and products made with them carry the verdict."""
-    file = tmp_path / "flight.csv"
+    """The exit code is 1; the files are written, and products made with them carry the verdict.
+
+    The table lists the corrections, and the calibration is unchanged.
+    """
+    file, calibration = tmp_path / "flight.csv", made.flown.folder / "left.true.toml"
+    was = calibration.read_bytes(), calibration.stat().st_mtime_ns
     file.write_bytes(lifted.read_bytes())
     judge_unusable(file, "the lever arm has another sign")
     output = tmp_path / "out"
@@ -171,6 +187,9 @@ def test_an_unusable_trajectory_is_reported_first_and_stays_unusable(
     assert line not in told.err
     (said,), source = file_verdicts(trajectory_of(output, ".sbet"), made.trajectory.span)
     assert (said.level, source) == (Level.UNUSABLE, "navigated")
+    check_table(made, told.out)
+    assert str(output / ADJUSTMENT) in told.out
+    assert (calibration.read_bytes(), calibration.stat().st_mtime_ns) == was
     assert run_app(arguments(made, file, output, "--strip-model", "constant", "--overwrite", "--accept-verdict")) == 0
     assert record_of(output)["verdict"]["accepted"]
 
@@ -274,21 +293,8 @@ def test_existing_files_are_kept(
     assert "needs --adjust DIR" in line
 
 
-@pytest.fixture(scope="module")
-def done(made: Made, lifted: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[AdjustOptions, StripsCorrected]:
-    """Return the outcome before it is written."""
-    folder = tmp_path_factory.mktemp("returns")
-    text = (made.flown.folder / "left.true.toml").read_text()
-    options = Options(datum="same", calibrations={"left": (text, str(made.flown.folder / "left.true.toml"))})
-    logs = GeorefOptions([made.flown.log], folder, TrajectoryOptions(lifted), replace(options, uncertainty=False))
-    request = AdjustOptions(logs, folder / "none")
-    return request, correct_strips(request, folder, lambda *_: None)
-
-
 @pytest.mark.parametrize("there", [True, False], ids=["folder there", "folder not there"])
-def test_a_full_disk_leaves_no_files(
-    done: tuple[AdjustOptions, StripsCorrected], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, there: bool
-) -> None:
+def test_a_full_disk_leaves_no_files(done: Done, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, there: bool) -> None:
     def full(record: Any, stream: Any) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -304,9 +310,7 @@ def test_a_full_disk_leaves_no_files(
     assert list(tmp_path.rglob("*")) == [output] * there
 
 
-def test_a_trajectory_is_written_back_about_the_plumb_line_of_its_input(
-    made: Made, done: tuple[AdjustOptions, StripsCorrected], tmp_path: Path
-) -> None:
+def test_a_trajectory_is_written_back_about_the_plumb_line_of_its_input(made: Made, done: Done, tmp_path: Path) -> None:
     """Otherwise the deflection of the vertical would be removed twice."""
     xi_eta_rad = tuple(np.radians([12.0 / 3600.0, -7.0 / 3600.0]))
     request, outcome = replace(done[0], output=tmp_path / "out"), done[1]
