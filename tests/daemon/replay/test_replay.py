@@ -26,7 +26,7 @@ from tests.daemon.log_check import LogContent, read_log
 from tests.daemon.rig import HANGS_S, Recorder, free_udp_port, one_processor, session_table
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("replay")]  # one worker records once what is replayed
-SECONDS = 18
+SECONDS = 10
 # it is LOCKED after the table's end too
 TIMED = ROVER_CONFIG.replace('protocol = "nmea"', 'protocol = "nmea"\nleap_seconds = 18')
 BUS = '[imu.main]\ntransport = "can:udp_multicast:239.74.163.2?port={port}"\nprotocol = "canmod-gps"\n'
