@@ -101,8 +101,8 @@ def sent(folder: Path) -> list[Turn]:
     return [Turn(*(int(word) for word in line.split())) for line in lines]
 
 
-def numbers(paths: list[Path]) -> dict[str, list[int]]:
-    """Return the numbers of the units in logs, in file order, for each kind of sensor."""
+def numbers(paths: list[Path], udp: str = "/scanner/left/raw") -> dict[str, list[int]]:
+    """Return the numbers of the units in logs, in file order, for each kind of sensor; ``udp`` names its topic."""
     found: dict[str, list[int]] = defaultdict(list)
     text = b""
     for session in open_logs(paths):
@@ -110,7 +110,7 @@ def numbers(paths: list[Path]) -> dict[str, list[int]]:
             topic = batch.channel.topic
             for row in batch.units:
                 data = row.tobytes()
-                if topic == "/scanner/left/raw":
+                if topic == udp:
                     found["udp"].append(int.from_bytes(data[:8], "little"))
                 elif topic == "/imu/main/raw":
                     found["can"].append(int.from_bytes(data[-8:], "little"))

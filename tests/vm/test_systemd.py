@@ -21,6 +21,16 @@ DISK_MB = 256
 COMES_BACK_S = 400.0  # measures nothing
 KILLS = 10
 SESSION = "split_minutes = 1440\n"
+# a device without a driver, recorded by a second recorder
+TAIL = """\
+[session]
+name = "tail"
+directory = "/var/lib/swath-tail"
+reserve_mb = 16
+split_minutes = 1440
+[raw.tail]
+transport = "udp:127.0.0.1:2369"
+"""
 RULES = """\
 SUBSYSTEM=="tty", ATTRS{idVendor}=="0403", ATTRS{serial}=="FT4XYZ12", SYMLINK+="rover"
 SUBSYSTEM=="tty", KERNEL=="ttyS1", TAG+="systemd", ENV{SYSTEMD_WANTS}+="swath-pps@ttyS1.service"
@@ -61,6 +71,7 @@ def service(place: Path) -> Iterator[Machine]:
     (overlay / "usr/local/lib/probe.py").write_bytes((machine.GUEST / "probe.py").read_bytes())
     for unit in SERVICES:
         (overlay / f"etc/systemd/system/probe-{unit}").write_text(probing_unit(unit))
+    (overlay / "etc/swath/tail.toml").write_text(TAIL)
     rules = overlay / "etc/udev/rules.d/91-aircraft.rules"
     rules.parent.mkdir(parents=True)
     rules.write_text(RULES)
@@ -234,6 +245,29 @@ def test_sighup_begins_a_part(service: Machine, place: Path) -> None:
     service.told("sleep 3")
     logs = fetched(service, place)
     found = aircraft.numbers([logs / old, logs / new])
+    for kind in ("udp", "can"):
+        assert aircraft.missing(found[kind]) == [], kind
+
+
+@pytest.mark.usefixtures("without_live")
+def test_a_second_recorder_records_with_its_own_configuration(service: Machine, place: Path) -> None:
+    first, pid = next_part(service), shown(service, "MainPID")
+    service.told("systemctl start swathd@tail", COMES_BACK_S)
+    assert shown(service, "User", "swathd@tail") == "swath"
+    sensors = "chrt -f 20 /usr/bin/python3 " + aircraft.SENSORS
+    service.told(f"mkdir /vm/tail; systemd-run -q --unit=sensors-tail {sensors} /vm/tail --udp 2369:100 --seconds 5")
+    service.until("! systemctl is-active sensors-tail")
+    service.told("/opt/swath/bin/swath mark 'line 4 start' /etc/swath/tail.toml", COMES_BACK_S)
+    service.told("systemctl stop swathd@tail", COMES_BACK_S)
+    service.told("mkdir /vm/tail/logs; cp /var/lib/swath-tail/*.mcap /vm/tail/logs/")
+    (log,) = (place / "vm/tail/logs").iterdir()
+    assert aircraft.numbers([log], udp="/raw/tail/raw")["udp"] == list(range(aircraft.sent(place / "vm/tail")[-1].udp))
+    codes = aircraft.event_codes(log)
+    assert codes[-1] == "session_ended"
+    assert "mark" in codes
+    assert shown(service, "MainPID") == pid
+    assert newest_log(service) == first
+    found = aircraft.numbers([fetched(service, place) / first])
     for kind in ("udp", "can"):
         assert aircraft.missing(found[kind]) == [], kind
 
