@@ -116,7 +116,7 @@ class Bench:
     def __init__(self, log: Path, folder: Path, *, sigmas: bool, count: bool = True) -> None:
         self.session: Session = open_logs([log])[0]
         self.setup = Setup.of_log(self.session.attachments(), Options(crs=CRS, uncertainty=sigmas))
-        self.clocks = read_clocks(self.session, self.setup)
+        self.clocks = read_clocks(self.session, self.setup.sources)
         buffer = TrajectoryBuffer(self.setup.sources.ins_protocol, name="ins")
         buffer.append(self.clocks.ins_rows)
         self.trajectory = buffer.snapshot()

@@ -18,7 +18,11 @@ class ExitCode(IntEnum):
     DAMAGE = 4  # data is damaged
 
 
-class UserError(Exception):
+class SwathError(Exception):
+    """The base of every error that Swath raises for its user; the text is what a command prints."""
+
+
+class UserError(SwathError):
     """An error that the user can mend; it is printed as ``swath: <message>``, each line of the message separately."""
 
     def __init__(self, message: str, exit_code: ExitCode = ExitCode.PROBLEM) -> None:

@@ -33,7 +33,7 @@ from swath.georef.timescales.device_clock import COARSE_MAX_SIGMA_NS
 from swath.georef.timescales.stamp_scale import AHEAD_NS, LEAST_SPAN_S
 
 if TYPE_CHECKING:
-    from swath.daemon.processing.setup.setup import Setup
+    from swath.daemon.processing.setup.sources import Sources
 
 LOOKED_AT_BYTES = 96 << 20  # how much of a log's scanner chunks is read, in pieces
 PIECES = 12
@@ -42,7 +42,7 @@ LEAST_SENTENCES_NS = SETTLED_SPAN_NS
 HOUR_NS = 3600 * SECOND_NS
 
 
-def find_stamps(index: LogIndex, setup: Setup, host: HostClocks) -> FrozenClocks:
+def find_stamps(index: LogIndex, sources: Sources, host: HostClocks) -> FrozenClocks:
     """Return the host's clocks together with what each scanner's stamps count from.
 
     If a head is its own clock, its time messages are fed to that clock here; if it sends none and its stamps are
@@ -52,7 +52,7 @@ def find_stamps(index: LogIndex, setup: Setup, host: HostClocks) -> FrozenClocks
     own = {source for source, plan in plans.items() if plan.clock == source}
     if not plans or (not own and all(plan.stamps is StampScale.FREE for plan in plans.values())):
         return FrozenClocks(host, {source: Stamps(StampScale.FREE, "as configured") for source in plans})
-    read = _Reader(setup, plans)
+    read = _Reader(sources, plans)
     read.take(index, _pieces(index.scanner_chunks()))
     for source in own:
         for message in read.messages[source]:
@@ -86,13 +86,11 @@ def _pieces(chunks: Sequence[ChunkPlace]) -> list[ChunkPlace]:
 class _Reader:
     """Collects the time messages, status and clock samples of scanners."""
 
-    def __init__(self, setup: Setup, plans: dict[str, DevicePlan]) -> None:
+    def __init__(self, sources: Sources, plans: dict[str, DevicePlan]) -> None:
         self.messages: dict[str, list[TimeMessage]] = {source: [] for source in plans}
         self.statuses: dict[str, list[DeviceStatus]] = {source: [] for source in plans}
         self._rows: dict[str, list[StructArray]] = {source: [] for source in plans}
-        self._parsers = {
-            source: parser for source, parser in setup.sources.scanner_time_parsers().items() if source in plans
-        }
+        self._parsers = {source: parser for source, parser in sources.scanner_time_parsers().items() if source in plans}
 
     def take(self, index: LogIndex, places: Sequence[ChunkPlace]) -> None:
         """Read chunks; damage is not reported here, but when the returns are read."""

@@ -210,7 +210,7 @@ def read_flights(request: GeorefOptions, tell: Tell, check: Check = lambda sessi
     refuse_different_settings(configs, request.options.crs, request.options.datum, request.options.epoch)
     flights: list[Flight] = []
     for session, setup in zip(sessions, setups, strict=True):
-        flights.append(_read(session, setup, tell, positions=request.trajectory.file is not None))
+        flights.append(_read(session, setup, tell, positions=request.trajectory.is_given))
     flights[0].holes += [f"skipped: {line}" for line in passed_over]
     refuse_overlap({flight.log: flight.span for flight in flights})
     flights.sort(key=lambda flight: flight.span)  # sessions come in host time, which may be wrong
@@ -257,7 +257,7 @@ def _read(session: Session, setup: Setup, tell: Tell, *, positions: bool) -> Fli
     log = session.parts[0].path
     session.progress = lambda done, total: tell("clocks", done, total, BYTES)
     listening = Listening(session)
-    clocks = read_clocks(listening, setup, positions=positions)
+    clocks = read_clocks(listening, setup.sources, positions=positions)
     session.growing = listening.growing
     try:
         setup.take_angles(clocks.angles)
@@ -267,7 +267,7 @@ def _read(session: Session, setup: Setup, tell: Tell, *, positions: bool) -> Fli
     first, last = index.spans()
     if not len(first):
         raise UserError(f"{log}: the log has no scanner data")
-    clocks.clocks = find_stamps(index, setup, clocks.clocks.host)
+    clocks.clocks = find_stamps(index, setup.sources, clocks.clocks.host)
     clocks.remarks += clocks.clocks.remarks
     flight = Flight(session, setup, clocks, index, (0, 0), (int(first.min()), int(last.max()) + 1))
     flight.lost = listening.lost()
@@ -305,6 +305,8 @@ def _judge(request: GeorefOptions, flight: Flight) -> None:
     if request.trajectory.file is not None:
         flight.trajectory_verdicts, flight.source = file_verdicts(request.trajectory.file, flight.span)
         flight.fixed_share = file_fixed_share(request.trajectory.file, flight.span)
+    elif request.trajectory.given is not None:
+        flight.source = "file"
     elif flight.navigated is not None:
         flight.trajectory_verdicts, flight.source = list(navigated_verdicts(flight.navigated)), "navigated"
         flight.fixed_share = navigated_fixed_share(flight.navigated)
@@ -389,7 +391,7 @@ def _straight(request: GeorefOptions, flight: Flight) -> list[Span]:
     (begin, end), (first, last) = flight.span, trajectory.span
     unknown = [(start, stop) for start, stop in trajectory.gaps().tolist()]
     outside = [(start, stop) for start, stop in ((begin, first), (last, end)) if start < stop]
-    if request.trajectory.file is not None:
+    if request.trajectory.is_given:
         unknown += outside
     else:
         flight.troubles += [

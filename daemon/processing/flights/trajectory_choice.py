@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -53,6 +53,8 @@ class TrajectoryOptions:
         navigate: without a file, navigate and smooth IMU and GNSS if the log has both, even if the device's own INS has
             a solution.
         force: use a file that does not belong to the log all the same, with a warning.
+        navigated: navigations done before, by session, which are used as they are.
+        given: a trajectory of the body's origin, in place of a file.
     """
 
     file: Path | None = None
@@ -60,11 +62,18 @@ class TrajectoryOptions:
     at: str = "body"
     navigate: bool = False
     force: bool = False
+    navigated: Mapping[str, Navigated] = field(default_factory=dict)
+    given: Trajectory | None = None
 
     def __post_init__(self) -> None:
         """Refuse with `UserError` to force a file if no file is given."""
         if self.force and self.file is None:
             raise UserError("--force-trajectory: needs --trajectory FILE, because it accepts that file", ExitCode.USAGE)
+
+    @property
+    def is_given(self) -> bool:
+        """True if the trajectory comes from outside the log, so that it is tested against the log."""
+        return self.file is not None or self.given is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,21 +116,27 @@ def choose_trajectory(
     navigated: Navigated | None = None
     both = setup.sources.imu_source is not None and bool(setup.config.gnss)
     offset = offset_of(request.at, setup)
+    file = str(request.file or (request.given.name if request.given is not None else ""))
+    done = request.navigated.get(session.session_id)
     try:
-        if request.file is None:
+        if request.given is not None:
+            trajectory = request.given
+            warnings = refuse_other_motion(clocks, trajectory, file, log)
+        elif done is not None:
+            navigated, trajectory = done, done.trajectory()
+            warnings = _warnings_of(done)
+        elif request.file is None:
             trajectory, solutions = _from_device(setup, clocks)
             if (request.navigate and both) or len(trajectory) < SHORTEST_TRAJECTORY:
                 navigated = _navigated(setup, session, solutions, tell)
-                trajectory = navigated.trajectory()
-                findings = [finding.text for leg in navigated.legs for finding in leg.findings]
-                warnings = [*navigated.warnings, *navigated.holes, *findings]
+                trajectory, warnings = navigated.trajectory(), _warnings_of(navigated)
         else:
             trajectory = _from_file(request, request.file, span, leap_seconds)
             warnings = refuse_other_motion(clocks, trajectory, str(request.file), log)
-        refuse_no_overlap(trajectory, str(request.file or trajectory.name), span, log)
+        refuse_no_overlap(trajectory, file or trajectory.name, span, log)
         trajectory.require_attitude()
         if navigated is None:
-            warnings += attitude_doubts(trajectory, str(request.file or f"{log}: {FROM_LOG}"))
+            warnings += attitude_doubts(trajectory, file or f"{log}: {FROM_LOG}")
         if setup.deflection_rad is not None:
             trajectory = trajectory.with_deflection(*setup.deflection_rad)
         if offset is not None and navigated is not None:
@@ -130,22 +145,28 @@ def choose_trajectory(
             )
         elif offset is not None:
             trajectory = trajectory.at_body(offset)
-        if request.file is not None:
-            warnings += _belonging(request, request.file, trajectory, setup, clocks, log)
+        if file:
+            warnings += _belonging(request, file, trajectory, setup, clocks, log)
     except TrajectoryError as error:
         named = str(error) if str(log) in str(error) else f"{error} ({log})"
         raise UserError(named) from error
     return Chosen(trajectory, warnings, solutions, navigated)
 
 
+def _warnings_of(navigated: Navigated) -> list[str]:
+    """Return doubts about a navigation, one line each."""
+    findings = [finding.text for leg in navigated.legs for finding in leg.findings]
+    return [*navigated.warnings, *navigated.holes, *findings]
+
+
 def _belonging(
-    request: TrajectoryOptions, file: Path, trajectory: Trajectory, setup: Setup, clocks: LogClocks, log: Path
+    request: TrajectoryOptions, file: str, trajectory: Trajectory, setup: Setup, clocks: LogClocks, log: Path
 ) -> list[str]:
     """Return doubts about a file's trajectory against the log; refuse one that does not belong to
     it with `UserError`.
     """
     offset = offset_of(request.at, setup) or (0.0, 0.0, 0.0)
-    given = Given(str(file), trajectory, offset, points_of(setup), setup.options.datum is not None)
+    given = Given(file, trajectory, offset, points_of(setup), setup.options.datum is not None)
     found = judge_given(given, setup, clocks, log)
     if found.refused and not request.force:
         raise UserError("\n".join(f"{line}; use --force-trajectory to accept it" for line in found.refused))

@@ -56,6 +56,7 @@ DROPPED = ".dropped.csv.gz"
 ENDINGS = (".laz", DROPPED)  # endings of a strip's files
 OFFSET_STEP = 1000.0  # files' offsets are whole kilometres
 TRAJECTORY_MARGIN_NS = 2_000_000_000
+REFUSED = (StripError, JobError, MappingError)
 
 
 @dataclass(frozen=True)
@@ -76,17 +77,30 @@ def georeference(request: GeorefOptions, tell: Tell) -> Report:
     def check(sessions: Sequence[Session], setups: Sequence[Setup]) -> None:
         check_space_for_returns(request.output, "points", LAZ_BYTES, sessions, setups)
 
-    with as_user_error(request.output, StripError, JobError, MappingError):
+    with as_user_error(request.output, *REFUSED):
         flights = read_flights(request, tell, check)
-        names = [flight.session.session_id for flight in flights]
-        with _out_of_sight(request, names) as (partial, into_place):
-            return _make(request, flights, names[0], partial, into_place, tell)
+    return write_points(request, flights, tell)
+
+
+def write_points(request: GeorefOptions, flights: Sequence[Flight], tell: Tell) -> Report:
+    """Make the products of a run whose flights have been read.
+
+    Raises:
+        UserError: they cannot be made, as in `georeference`.
+    """
+    names = [flight.session.session_id for flight in flights]
+    with as_user_error(request.output, *REFUSED), _out_of_sight(request, names) as (partial, into_place):
+        return _make(request, flights, names[0], partial, into_place, tell)
 
 
 # ---------------------------------------------------------------------- jobs
 
 
-def _jobs(request: GeorefOptions, flight: Flight, number: int, partial: Path) -> list[Job]:
+def jobs_of(request: GeorefOptions, flight: Flight, number: int, partial: Path) -> list[Job]:
+    """Return the jobs of a flight with its number: one a strip, and one a piece between strips.
+
+    Each writes its files to the folder ``partial``.
+    """
     tiles = segments(flight.strips, *flight.host_span, first_number=flight.first_number)
     return [_job(request, flight, number, tile, partial) for tile in tiles]
 
@@ -246,7 +260,7 @@ def _make(
     origin = _origin(flights)
     numbers = _numbers(flights)
     plans = [_plan(request, flight, origin, numbers) for flight in flights]
-    jobs = [job for number, flight in enumerate(flights) for job in _jobs(request, flight, number, partial)]
+    jobs = [job for number, flight in enumerate(flights) for job in jobs_of(request, flight, number, partial)]
     total = sum(job.size for job in jobs)
     given_up, reached = Event(), Reached(lambda done, total: tell("points", done, total, BYTES))
     with ThreadPoolExecutor(1) as hasher, room_noted(partial, reached.share):

@@ -169,7 +169,7 @@ def read_inputs(session: Session, request: InputOptions, storage: Storage = IN_M
     parts = placed.observations(outside, use_ins=request.ins == "observe")
     observations = joined(list(parts.values()))
     refuse_elsewhere(inertial, observations, sources, request.positions, log)
-    legs, short = _legs(inertial, observations)
+    legs, short = legs_of(inertial, observations)
     warnings = input_doubts(found, sources, times, parts, log)
     missing = _missing(times, sampler, short, sources.imu.rate_hz)
     holes = [*session_holes(session), *(f"{log}: {sources.imu_source}: {part.text}" for part in missing)]
@@ -284,7 +284,7 @@ def _explained(gaps: Sequence[Stretch], sampler: Sampler, rate_hz: float) -> lis
     return [*found, *left.values()]
 
 
-def _legs(inertial: Inertial, observations: StructArray) -> tuple[list[Leg], list[Stretch]]:
+def legs_of(inertial: Inertial, observations: StructArray) -> tuple[list[Leg], list[Stretch]]:
     """Return the pieces between gaps that are not bridged, with their observations; and pieces that are too short."""
     begins_ns = inertial.time_ns - np.rint(inertial.interval_s * SECOND_NS).astype(np.int64)
     apart = np.flatnonzero(begins_ns[1:] - inertial.time_ns[:-1] > inertial.interval_s[1:] * SECOND_NS / 2) + 1

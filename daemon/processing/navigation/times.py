@@ -50,7 +50,8 @@ class ImuTimes:
     Attributes:
         rows: `IMU_DTYPE` rows of these samples.
         gps_ns: (n,) GPS times of their stamps.
-        sigma_s: usual standard deviation of a time (median).
+        sigma_ns: (n,) standard deviations of these times.
+        placed: (m,) flags of these among all samples.
         by: source of the times: gps (the unit gives GPS time itself), latch (of the PPS), counter, arrival.
         refused: samples without a time, by reason.
         discarded: stretches of such samples that are longer than `LEAST_HOLE_S`.
@@ -58,10 +59,16 @@ class ImuTimes:
 
     rows: StructArray
     gps_ns: Int64Array
-    sigma_s: float
+    sigma_ns: FloatArray
+    placed: BoolArray
     by: str
     refused: Counter[str]
     discarded: tuple[Stretch, ...] = ()
+
+    @property
+    def sigma_s(self) -> float:
+        """The usual standard deviation of a time (median)."""
+        return float(np.median(self.sigma_ns)) / SECOND_NS if len(self.sigma_ns) else 0.0
 
 
 def imu_times(rows: StructArray, host: HostClocks, clock: str | None, rate_hz: float) -> ImuTimes:
@@ -78,9 +85,11 @@ def imu_times(rows: StructArray, host: HostClocks, clock: str | None, rate_hz: f
         taken = rows[own]
         gps_ns = taken["gps_week"].astype(np.int64) * WEEK_NS + taken["device_time_ns"]
         untimed = stretches(rows["host_time_ns"], own, gps_ns, rate_hz, "samples without a GPS week")
-        return ImuTimes(taken, gps_ns, 0.0, "gps", _reasons(no_gps_week=int((~own).sum())), untimed)
+        refused = _reasons(no_gps_week=int((~own).sum()))
+        return ImuTimes(taken, gps_ns, np.zeros(len(taken)), own, "gps", refused, untimed)
     if clock is None or not len(rows):
-        return ImuTimes(rows[:0], np.empty(0, np.int64), 0.0, "arrival", _reasons(no_clock=len(rows)))
+        none = np.zeros(len(rows), np.bool_)
+        return ImuTimes(rows[:0], np.empty(0, np.int64), np.empty(0), none, "arrival", _reasons(no_clock=len(rows)))
     counted = rows["device_time_ns"] >= 0
     if counted.any():
         taken, device_ns = rows[counted], rows["device_time_ns"][counted]
@@ -89,13 +98,12 @@ def imu_times(rows: StructArray, host: HostClocks, clock: str | None, rate_hz: f
     gps_ns, sigma_ns, latched = _by_device(taken, device_ns, host, clock)
     good = sigma_ns <= GREATEST_SIGMA_NS
     by = "arrival" if not counted.any() else "latch" if latched else "counter"
-    sigma_s = float(np.median(sigma_ns[good])) / SECOND_NS if good.any() else 0.0
     refused = _reasons(no_device_time=len(rows) - len(taken), no_clock=int((~good).sum()))
     placed = counted.copy() if counted.any() else np.ones(len(rows), np.bool_)
     placed[placed] = good
     why = f"the clock of {clock} cannot time these samples to {GREATEST_SIGMA_NS / 1e9:.0f} s"
     untimed = stretches(rows["host_time_ns"], placed, gps_ns[good], rate_hz, why)
-    return ImuTimes(taken[good], gps_ns[good], sigma_s, by, refused, untimed)
+    return ImuTimes(taken[good], gps_ns[good], sigma_ns[good], placed, by, refused, untimed)
 
 
 def stretches(

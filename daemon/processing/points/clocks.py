@@ -16,7 +16,7 @@ from swath.daemon.log.host_messages import edges_of, readings_of
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.reader import Session
 from swath.daemon.processing.points.runs import Run
-from swath.daemon.processing.setup.setup import Setup
+from swath.daemon.processing.setup.sources import Sources
 from swath.georef.arrays import StructArray
 from swath.georef.records import (
     IMU_DTYPE,
@@ -64,17 +64,17 @@ class LogClocks:
 class _ClockReader:
     """Collects records of every source except scanners."""
 
-    def __init__(self, setup: Setup, session: Session, *, positions: bool) -> None:
-        self.host = HostClocks(setup.sources.clock_plan(session.info), keep_history=True)
+    def __init__(self, sources: Sources, session: Session, *, positions: bool, motion: bool) -> None:
+        self.host = HostClocks(sources.clock_plan(session.info), keep_history=True)
         self.fixes: dict[str, list[GnssFix]] = {}
         self._positions = positions
         self.ins: list[StructArray] = []
         self.imu: list[StructArray] = []
-        self.gimbals: dict[str, list[StructArray]] = {source: [] for source in setup.sources.gimbal_sources}
+        self.gimbals: dict[str, list[StructArray]] = {source: [] for source in sources.gimbal_sources}
         self.counts: dict[str, Counter[str]] = {}
         self.remarks: list[str] = []
-        self._setup = setup
-        self._parsers = setup.sources.parsers(("gnss", "imu"), whole=positions)
+        self._sources = sources
+        self._parsers = sources.parsers(("gnss", "imu") if motion else ("gnss",), whole=positions)
         self._runs: dict[str, Run] = {}
 
     def take(self, batch: LogBatch) -> None:
@@ -85,12 +85,12 @@ class _ClockReader:
             for reading in readings_of(batch):
                 self.host.add_reading(*reading)
         elif source is not None and source.startswith("pps/"):
-            edge = self._setup.sources.edge_of(source)
+            edge = self._sources.edge_of(source)
             for found in edges_of(batch, edge) if edge is not None else ():
                 if found is not None:
                     self.host.add_edge(source, found)
         elif source is not None:  # only the source's own order matters: times are settled all at once
-            run = self._runs.setdefault(source, Run(partial(self._parse, self._setup.sources.inside(source))))
+            run = self._runs.setdefault(source, Run(partial(self._parse, self._sources.inside(source))))
             run.add(ChunkBatch(source, batch.log_time_ns, batch.units))
 
     def _parse(self, names: Iterable[str], batches: list[ChunkBatch]) -> None:
@@ -113,7 +113,7 @@ class _ClockReader:
         found: dict[str, AngleSeries] = {}
         for source, pieces in sorted(self.gimbals.items()):
             rows = np.concatenate(pieces) if pieces else np.empty(0, INS_DTYPE)
-            is_solution = SOLUTION_STATUS.get(self._setup.sources.protocol(source))
+            is_solution = SOLUTION_STATUS.get(self._sources.protocol(source))
             with suppress(MountError):  # fewer than two angles: the code that needs them reports it
                 found[source] = AngleSeries.of_solutions(
                     rows if is_solution is None else rows[is_solution(rows["status"])]
@@ -128,36 +128,36 @@ class _ClockReader:
             counts[type(record).__name__] += 1 if rows is None else len(rows)
             if isinstance(record, TimeMessage) and source in self.host.plan.gnss:
                 self.host.add_message(source, record)
-            elif isinstance(record, InsSolution) and source == self._setup.sources.ins_source:
+            elif isinstance(record, InsSolution) and source == self._sources.ins_source:
                 self.ins.append(record.rows)
             elif isinstance(record, InsSolution) and source in self.gimbals:
                 self.gimbals[source].append(record.rows)
-            elif isinstance(record, ImuSamples) and source == self._setup.sources.imu_source:
+            elif isinstance(record, ImuSamples) and source == self._sources.imu_source:
                 self.imu.append(record.rows)
             elif isinstance(record, GnssFix) and self._positions:
                 self.fixes.setdefault(source, []).append(record)
 
 
-def read_clocks(session: Session, setup: Setup, *, positions: bool = False) -> LogClocks:
+def read_clocks(session: Session, sources: Sources, *, positions: bool = False, motion: bool = True) -> LogClocks:
     """Read all messages of a session except the scanners', a first pass before its returns are georeferenced.
 
     Scanners' data are skipped chunk by chunk: a chunk holds one class of channels. With ``positions`` the receivers'
-    fixes and the IMU's specific forces are kept too.
+    fixes and the IMU's specific forces are kept too; without ``motion`` nothing of the IMUs is read.
     """
-    reader = _ClockReader(setup, session, positions=positions)
+    reader = _ClockReader(sources, session, positions=positions, motion=motion)
     for batch in session.batches(lambda topic: not topic.startswith("/scanner/"), skim=True):
         reader.take(batch)
     reader.close()
-    ins = setup.sources.ins_rows(np.concatenate(reader.ins) if reader.ins else np.empty(0, INS_DTYPE))
+    ins = sources.ins_rows(np.concatenate(reader.ins) if reader.ins else np.empty(0, INS_DTYPE))
     imu = np.concatenate(reader.imu) if reader.imu else np.empty(0, IMU_DTYPE)
     gps_ns, rate_b, force_b = np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3))
-    clock = setup.sources.clock_of_imu
+    clock = sources.clock_of_imu
     if len(imu) and clock is not None:
         gps_ns, sigma_ns = reader.host.gps_from_host(clock, imu["host_time_ns"])
         known = sigma_ns <= StreamSettings().max_time_sigma_ns  # a worse clock cannot test a trajectory's time
-        gps_ns, rate_b = gps_ns[known], setup.sources.in_b(imu["angular_rate_b"][known])
+        gps_ns, rate_b = gps_ns[known], sources.in_b(imu["angular_rate_b"][known])
         if positions:
-            force_b = setup.sources.in_b(imu["specific_force_b"][known])
+            force_b = sources.in_b(imu["specific_force_b"][known])
     host = FrozenClocks(reader.host)
     found = LogClocks(host, ins, gps_ns, rate_b, reader.angles(), reader.counts, force_b, reader.fixes)
     found.remarks = reader.remarks

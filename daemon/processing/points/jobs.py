@@ -250,6 +250,14 @@ def feed_job(
     tell: Tell,
 ) -> None:
     """Pass a job's messages through its own feed, close the feed, and count the fates of returns."""
+    for placed in placed_points(plan, job, result, feed, tell):
+        write(placed)
+
+
+def placed_points(
+    plan: JobPlan, job: Job, result: JobResult, feed: LogFeed, tell: Tell = lambda size: None
+) -> Iterator[list[tuple[str, Points]]]:
+    """Yield a job's points as they are placed, with their scanner's names; at the end, count the fates of returns."""
     stream = feed.stream
     undecoded = Undecoded({name: feed.parser(f"scanner/{name}") for name in stream.scanners})
     was_own = False
@@ -258,8 +266,8 @@ def feed_job(
             feed.flush()  # units are decoded and counted as own or context, as when they came
             undecoded.note(own=was_own)
             was_own = own
-        write(feed.take(batch, context=not own))
-    write(feed.close())
+        yield feed.take(batch, context=not own)
+    yield feed.close()
     undecoded.note(own=was_own)
     result.undecoded = undecoded.counts
     for name in stream.scanners:

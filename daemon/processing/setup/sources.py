@@ -84,7 +84,7 @@ class Sources:
     def clock_of_imu(self) -> str | None:
         """The source of the host's time for that IMU."""
         source = self.imu_source
-        return None if source is None else self._clock_of(self.config.imu[source.removeprefix("imu/")].pps)
+        return None if source is None else self.clock_of(self.config.imu[source.removeprefix("imu/")].pps)
 
     def edge_of(self, source: str) -> str | None:
         """Return the polarity of the edges of ``pps/name``; None: there is no such source."""
@@ -171,7 +171,7 @@ class Sources:
         for name in self.scanners:
             table, source = config.scanner[name], f"scanner/{name}"
             driver = find_driver("scanner", table.protocol)
-            clock = self._clock_of(table.pps)
+            clock = self.clock_of(table.pps)
             if clock is None:
                 heads[source] = GnssPlan()
             wanted = StampScale(table.clock) if driver.past_hour or not driver.line_scanner else None
@@ -192,7 +192,7 @@ class Sources:
             devices=devices,
         )
 
-    def _clock_of(self, pps: str | None) -> str | None:
+    def clock_of(self, pps: str | None) -> str | None:
         """Return the clock of a device: its pulse's; for a device without one, the first that the host has."""
         if pps is not None:
             return f"pps/{pps}"

@@ -215,7 +215,7 @@ def ins_as_is(session: Session, config: Config | None) -> AsIs:
     except UserError as error:
         lines = [f"{log}: {line}" for line in error.message.splitlines()]
         raise UserError("\n".join(lines), error.exit_code) from error
-    clocks = read_clocks(session, setup)
+    clocks = read_clocks(session, setup.sources)
     if setup.sources.ins_source is None or not len(clocks.ins_rows):
         raise UserError(f"{log}: the log has no INS solution; leave --ins as-is out to navigate from its IMU and GNSS")
     buffer = TrajectoryBuffer(setup.sources.ins_protocol, name=session.session_id)

@@ -65,7 +65,7 @@ class Log:
 
 def read(flown: Flown) -> Log:
     setup = Setup.of_log(flown.session().attachments(), Options(uncertainty=False))
-    clocks = read_clocks(flown.session(), setup, positions=True)
+    clocks = read_clocks(flown.session(), setup.sources, positions=True)
     truth = flown.truth()
     assert len(clocks.imu_force_b) == len(clocks.imu_rate_b) > 0
     return Log(flown, setup, clocks, replace(truth, name="x.out"))

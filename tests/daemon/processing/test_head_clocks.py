@@ -123,7 +123,7 @@ def found(folder: Path, text: str, units: Iterable[tuple[str, int, bytes]]) -> t
     log.finish()
     (session,) = open_logs([folder / "logs"])
     setup = Setup.of_log(session.attachments())
-    return setup, find_stamps(index_log(session), setup, read_clocks(session, setup).clocks.host)
+    return setup, find_stamps(index_log(session), setup.sources, read_clocks(session, setup.sources).clocks.host)
 
 
 def errors_ns(clocks: FrozenClocks, stamps_ns: list[int], locked: int | list[int]) -> tuple[list[int], float]:

@@ -30,7 +30,8 @@ def holes(spoil: Spoil, count: int) -> list[Stretch]:
     spoil(rows, stamps_ns, slice(FIRST, FIRST + count))
     sampler = Sampler(RATE_HZ)
     sampler.feed(rows, stamps_ns)
-    return _missing(ImuTimes(rows, stamps_ns, 0.0, "gps", Counter()), sampler, (), RATE_HZ)
+    times = ImuTimes(rows, stamps_ns, np.zeros(len(rows)), np.ones(len(rows), np.bool_), "gps", Counter())
+    return _missing(times, sampler, (), RATE_HZ)
 
 
 def no_numbers(rows: StructArray, stamps_ns: Int64Array, at: slice) -> None:

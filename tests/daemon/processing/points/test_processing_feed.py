@@ -226,7 +226,7 @@ def opened(path: Path) -> PartFollower | None:
 
 @pytest.fixture(scope="module")
 def known(setup: Setup, flown: Flown) -> LogClocks:
-    return read_clocks(flown.session(), setup)
+    return read_clocks(flown.session(), setup.sources)
 
 
 def test_the_first_pass_skips_scanner_data(
@@ -240,7 +240,7 @@ def test_the_first_pass_skips_scanner_data(
         return unpack(body)
 
     monkeypatch.setattr(scan_module, "unpack_chunk", counted)
-    again = read_clocks(flown.session(), setup)
+    again = read_clocks(flown.session(), setup.sources)
     size = sum(path.stat().st_size for path in (flown.folder / "logs").glob("*.mcap"))
     assert sum(unpacked) < 0.5 * size
     assert again.ins_rows.tobytes() == known.ins_rows.tobytes()

@@ -1,0 +1,328 @@
+"""Reads the records of a log's sources, all or a slice of time; of a slice only its chunks are read.
+
+The host's clock is settled by the whole log first, because a receiver may name a wrong second at its beginning; only
+edges, readings of clocks and receivers' messages are read for it. The clock of an IMU or a scanner is then found from
+the slice and a margin around it, with a sigma that says how well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from swath.daemon.config.config import Config
+from swath.daemon.config.tables import ImuConfig
+from swath.daemon.errors import UserError
+from swath.daemon.log.chunk_index import LogIndex, index_log, read_chunks
+from swath.daemon.log.format import source_of_topic
+from swath.daemon.log.mcap.chunks import LogBatch
+from swath.daemon.log.reader import PartDamage, Session
+from swath.daemon.processing.head_clocks import find_stamps
+from swath.daemon.processing.navigation.observations import gps_times
+from swath.daemon.processing.navigation.sources import config_of_log, files_of
+from swath.daemon.processing.navigation.times import imu_times
+from swath.daemon.processing.points.clocks import read_clocks
+from swath.daemon.processing.points.runs import Run
+from swath.daemon.processing.records.tables import KINDS, NO_TIME_NS, RecordKind, timed_rows
+from swath.daemon.processing.setup.sources import Sources
+from swath.drivers.parser import DeviceKind, Parser, ParserCounters
+from swath.georef.arrays import Int64Array, StructArray
+from swath.georef.records import (
+    ChunkBatch,
+    DeviceClockSamples,
+    ImuSamples,
+    InsSolution,
+    Record,
+    ScannerReturns,
+)
+from swath.georef.stream.clocks import FrozenClocks, HostClocks, StreamClocks
+from swath.georef.timescales import SECOND_NS
+
+MARGIN_NS = 5 * SECOND_NS  # messages before a slice that belong to its epochs, and edges that a scanner latched
+IMU_MARGIN_NS = 60 * SECOND_NS  # over which the counter of an IMU without a latch is compared with arrivals
+SETTLE_NS = 2 * SECOND_NS  # returns wait for latched edges on both sides, as in georeferencing
+EVER = (-(1 << 62), 1 << 62)
+Span = tuple[int, int]
+
+
+@dataclass
+class LogRecords:
+    """Gives the records of one session's sources.
+
+    Attributes:
+        config: configuration of the log, or another one.
+        counters: counts of the parser that read a source last, by source.
+        damage: parts of the files that could not be read.
+    """
+
+    session: Session
+    config: Config
+    files: dict[str, bytes]
+    counters: dict[str, ParserCounters] = field(default_factory=dict)
+    damage: list[PartDamage] = field(default_factory=list)
+
+    @classmethod
+    def of_session(cls, session: Session, config: Config | None = None) -> LogRecords:
+        """Return the records of a session.
+
+        Raises:
+            UserError: the log holds no configuration that can be used, and none is given.
+            OSError: a file that a given configuration names cannot be read.
+        """
+        files = files_of(session, config)
+        try:
+            return cls(session, config or config_of_log(files), files)
+        except UserError as error:
+            raise UserError(f"{session.parts[0].path}: {error}", error.exit_code) from error
+
+    @cached_property
+    def _sources(self) -> Sources:
+        return Sources(self.config, self.files, sorted(self.config.scanner))
+
+    @cached_property
+    def _index(self) -> LogIndex:
+        return index_log(self.session)
+
+    @cached_property
+    def _host(self) -> HostClocks:
+        return read_clocks(self.session, self._sources, motion=False).clocks.host
+
+    @cached_property
+    def _frozen(self) -> FrozenClocks:
+        return find_stamps(self._index, self._sources, self._host)
+
+    @property
+    def sources(self) -> dict[str, DeviceKind]:
+        """The kinds of the configured devices by source."""
+        return {f"{kind}/{name}": kind for kind, name, _ in self.config.device_tables()}
+
+    def protocol(self, source: str) -> str:
+        """Return a source's protocol."""
+        return next(table.protocol for kind, name, table in self.config.device_tables() if f"{kind}/{name}" == source)
+
+    def host_span(self, start_ns: int | None, stop_ns: int | None) -> Span:
+        """Return the host's times of a span of GPS time, [start, stop); None: the log's begin or end.
+
+        Raises:
+            UserError: the log does not know GPS time.
+        """
+        if start_ns is None and stop_ns is None:
+            return EVER
+        clock = self._clock()
+        if clock is None:
+            raise UserError(f"{self.session.parts[0].path}: no GPS time is known in this log; leave start and stop out")
+        first = min((place.start_ns for place in self._index.chunks), default=0)
+        found = [
+            edge if given is None else self._host_from_gps(clock, given, first)
+            for given, edge in ((start_ns, EVER[0]), (stop_ns, EVER[1]))
+        ]
+        return found[0], found[1]
+
+    def _clock(self) -> str | None:
+        """Return the source whose clock gives the host's time; None: no clock has locked."""
+        at = np.array([place.end_ns for place in self._index.chunks[-1:]], np.int64)
+        for source in [*self._host.plan.pps, *self._host.plan.gnss]:
+            if len(at) and np.isfinite(self._host.gps_from_host(source, at)[1]).all():
+                return source
+        return None
+
+    def _host_from_gps(self, clock: str, gps_ns: int, near_ns: int) -> int:
+        """Return the host's time of a GPS time; the two clocks differ by parts in a million, so few steps suffice."""
+        host_ns = near_ns
+        for _ in range(4):
+            there, _sigma = self._host.gps_from_host(clock, np.array([host_ns], np.int64))
+            host_ns += gps_ns - int(there[0])
+        return host_ns
+
+    def span(self) -> Span | None:
+        """Return the GPS times of the log's first and last message; None: no GPS time is known."""
+        clock = self._clock()
+        if clock is None:
+            return None
+        ends = [min(p.start_ns for p in self._index.chunks), max(p.end_ns for p in self._index.chunks)]
+        first, last = self._host.gps_from_host(clock, np.array(ends, np.int64))[0].tolist()
+        return first, last
+
+    # ------------------------------------------------------------------ reading
+
+    def units(self, source: str, host_span: Span = EVER) -> Iterator[tuple[int, bytes]]:
+        """Yield the units of the wire that carries a source, with their host times, ns."""
+        for batch in self._batches(source, host_span):
+            inside = (batch.host_time_ns >= host_span[0]) & (batch.host_time_ns < host_span[1])
+            for time_ns, unit in zip(batch.host_time_ns[inside].tolist(), batch.units[inside], strict=True):
+                yield time_ns, unit.tobytes()
+
+    def records(self, source: str, host_span: Span = EVER) -> Iterator[list[Record]]:
+        """Yield the records of a source as its parser gives them, in pieces, from the chunks of a span of host time."""
+        parser = self._parser(source)
+        self.counters[source] = parser.counters
+        found: list[Record] = []
+        run = Run(lambda batches: found.extend(parser.feed_batches(batches)))
+        for batch in self._batches(source, host_span):
+            run.add(batch)
+            if found:
+                yield found.copy()
+                found.clear()
+        run.flush()
+        yield [*found, *parser.close()]
+
+    def _parser(self, source: str) -> Parser:
+        return self._sources.parsers((self.sources[source],), whole=True)[source]
+
+    def _batches(self, source: str, host_span: Span) -> Iterator[ChunkBatch]:
+        """Yield the units of a source's wire from the chunks that reach into a span of host time."""
+        scanner = self.sources[source] == "scanner"
+        start_ns, stop_ns = host_span
+
+        def is_of_wire(topic: str) -> bool:
+            wire = (source_of_topic(topic) or "").removesuffix("/aux")
+            return bool(wire) and source in self._sources.inside(wire)
+
+        places = [
+            place
+            for place in self._index.chunks
+            if (place.scanner if scanner else place.other) and place.start_ns < stop_ns and place.end_ns >= start_ns
+        ]
+        for batch in read_chunks(self._index, places, is_of_wire, self.damage):
+            yield _chunk_batch(batch)
+
+    # ------------------------------------------------------------------ tables
+
+    def table(self, source: str, name: str, start_ns: int | None = None, stop_ns: int | None = None) -> StructArray:
+        """Return a table (n,) of a source's records of one kind in a span of GPS time, [start, stop).
+
+        Args:
+            source: ``gnss/rover``.
+            name: a name in `KINDS`.
+            start_ns, stop_ns: GPS ns; None: the log's begin or end. Without both, records without a time come too.
+
+        Raises:
+            UserError: the log does not know GPS time, and a span is wanted.
+        """
+        kind = KINDS[name]
+        if kind.record is ScannerReturns:
+            pieces = list(self.returns(source, start_ns, stop_ns))
+            return np.concatenate(pieces) if pieces else np.empty(0, kind.dtype)
+        begin, end = self.host_span(start_ns, stop_ns)
+        margin = IMU_MARGIN_NS if kind.record is ImuSamples else MARGIN_NS
+        wanted = [
+            record
+            for records in self.records(source, (begin - margin, end + margin))
+            for record in records
+            if isinstance(record, kind.record)
+        ]
+        return _within(self._placed(source, kind, wanted), start_ns, stop_ns)
+
+    def _placed(self, source: str, kind: RecordKind, records: list[Any]) -> StructArray:
+        """Return a table of records with their GPS times."""
+        if kind.record is ImuSamples:
+            return self._samples(source, records)
+        table = kind.table(records)
+        if kind.record is InsSolution:
+            table["time_sigma_s"][table["gps_ns"] >= 0] = 0.0
+            return table
+        if kind.tag is None:
+            self._by_arrival(source, table)
+            return table
+        clock = source if source in self._host.by_source else None
+        tags = [kind.tag(record) for record in records]
+        times = gps_times(self._host, clock, table["host_time_ns"].tolist(), tags)
+        known = np.array([time is not None for time in times], np.bool_)
+        table["gps_ns"] = [NO_TIME_NS if time is None else time for time in times]
+        table["time_sigma_s"][known & np.isnan(table["time_sigma_s"])] = 0.0
+        return table
+
+    def _samples(self, source: str, records: list[ImuSamples]) -> StructArray:
+        rows = np.concatenate([record.rows for record in records]) if records else KINDS["samples"].table([])
+        if not len(rows):
+            return KINDS["samples"].table([])
+        imu = self._imu(source)
+        times = imu_times(rows, self._host, self._sources.clock_of(imu.pps), imu.rate_hz)
+        table = timed_rows(rows)
+        table["gps_ns"][times.placed], table["time_sigma_s"][times.placed] = times.gps_ns, times.sigma_ns / SECOND_NS
+        return table
+
+    def _imu(self, source: str) -> ImuConfig:
+        return self.config.imu[source.removeprefix("imu/")]
+
+    def _by_arrival(self, source: str, table: StructArray) -> None:
+        """Give a table the times at which its records arrived."""
+        clock = source if source in self._host.by_source else self._clock()
+        if clock is None:
+            return
+        gps_ns, sigma_ns = self._host.gps_from_host(clock, table["host_time_ns"])
+        known = np.isfinite(sigma_ns)
+        table["gps_ns"][known], table["time_sigma_s"][known] = gps_ns[known], sigma_ns[known] / SECOND_NS
+
+    def returns(self, source: str, start_ns: int | None = None, stop_ns: int | None = None) -> Iterator[StructArray]:
+        """Yield tables of a scanner's returns in a span of GPS time, in order of arrival; memory is bounded.
+
+        Raises:
+            UserError: the log does not know GPS time, and a span is wanted.
+        """
+        begin, end = self.host_span(start_ns, stop_ns)
+        waiting = _Waiting(source, self._frozen.for_stream())
+        for records in self.records(source, (begin - MARGIN_NS, end + MARGIN_NS)):
+            for table in waiting.take(records):
+                yield from _some(_within(table, start_ns, stop_ns))
+        for table in waiting.close():
+            yield from _some(_within(table, start_ns, stop_ns))
+
+
+class _Waiting:
+    """Holds returns until their device's clock is known on both sides of them."""
+
+    def __init__(self, source: str, clocks: StreamClocks) -> None:
+        self._source, self._clocks = source, clocks
+        self._held: list[StructArray] = []
+
+    def take(self, records: list[Record]) -> Iterator[StructArray]:
+        """Take a piece's records; yield tables of returns whose times are known now."""
+        newest_ns = 0
+        for record in records:
+            if isinstance(record, DeviceClockSamples):
+                self._clocks.add_samples(self._source, record.rows)
+                newest_ns = max(newest_ns, int(record.rows["host_time_ns"].max(initial=0)))
+            elif isinstance(record, ScannerReturns) and len(record.rows):
+                self._held.append(record.rows)
+        while self._held and int(self._held[0]["host_time_ns"][-1]) < newest_ns - SETTLE_NS:
+            yield self._timed(self._held.pop(0))
+
+    def close(self) -> Iterator[StructArray]:
+        """Yield the tables that still wait."""
+        while self._held:
+            yield self._timed(self._held.pop(0))
+
+    def _timed(self, rows: StructArray) -> StructArray:
+        self._clocks.update()
+        gps_ns, sigma_ns = self._clocks.gps_from_device(self._source, rows["device_time_ns"], rows["host_time_ns"])
+        table, known = timed_rows(rows), np.isfinite(sigma_ns)
+        table["gps_ns"][known], table["time_sigma_s"][known] = gps_ns[known], sigma_ns[known] / SECOND_NS
+        return table
+
+
+def _chunk_batch(batch: LogBatch) -> ChunkBatch:
+    return ChunkBatch(source_of_topic(batch.channel.topic) or "", batch.log_time_ns, batch.units)
+
+
+def _within(table: StructArray, start_ns: int | None, stop_ns: int | None) -> StructArray:
+    """Return the rows in a span of GPS time, [start, stop); without a span, all rows."""
+    if start_ns is None and stop_ns is None:
+        return table
+    gps_ns: Int64Array = table["gps_ns"]
+    inside = gps_ns != NO_TIME_NS
+    if start_ns is not None:
+        inside &= gps_ns >= start_ns
+    if stop_ns is not None:
+        inside &= gps_ns < stop_ns
+    rows: StructArray = table[inside]
+    return rows
+
+
+def _some(table: StructArray) -> Iterator[StructArray]:
+    if len(table):
+        yield table
