@@ -13,3 +13,4 @@ from swath.processing import georeference as georeference
 from swath.processing import navigate as navigate
 
 __version__: str
+__all__: list[str]
