@@ -13,7 +13,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Literal
 
 from swath.drivers.parser import ChosenRecords, DeviceKind, DeviceSettings, Parser, RawParser
-from swath.georef.records import EventMark, GnssFix, GnssHeading, NamesEdge, TimeMessage
+from swath.georef.records import ByteRows, EventMark, GnssFix, GnssHeading, NamesEdge, TimeMessage
 
 if TYPE_CHECKING:
     from swath.drivers.startup import StartupMessage, StartupOptions
@@ -123,6 +123,21 @@ def _letters(text: str) -> str:
 
 
 @dataclass(frozen=True, slots=True)
+class SentFile:
+    """Describes what a device sends that serves as its ``geometry.file``, where none is configured.
+
+    Attributes:
+        what: its name in a message to the user, in the singular.
+        find: returns the content from units (n, length) of equal length; None: they do not contain it.
+        example: makes such content of no device, to try things out without data.
+    """
+
+    what: str
+    find: Callable[[ByteRows], bytes | None]
+    example: Callable[[], bytes]
+
+
+@dataclass(frozen=True, slots=True)
 class Driver:
     """Holds what a protocol file declares about one protocol in its ``DRIVERS`` tuple.
 
@@ -150,6 +165,7 @@ class Driver:
         past_hour: whether a scanner's device time counts from the last full hour of UTC.
         bytes_per_s: the most that a device of this protocol sends, by its maker's data sheet; None: unknown, taken as
             that of a large scanner for a scanner, and as little for others.
+        sent_file: what a scanner itself sends that serves as its ``geometry.file``; None: it sends no such thing.
         startup: builds the messages that a device needs before a survey, in sending order, and raises
             `DriverSettingsError`; None where the device needs no such message.
     """
@@ -171,6 +187,7 @@ class Driver:
     eight_bit_intensity: bool = False
     past_hour: bool = False
     bytes_per_s: float | None = None
+    sent_file: SentFile | None = None
     startup: Callable[[DeviceSettings, StartupOptions], tuple[StartupMessage, ...]] | None = None
 
 

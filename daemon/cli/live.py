@@ -122,6 +122,7 @@ def _follow(
     from swath.daemon.config.tables import LiveConfig
     from swath.daemon.processing.compiling import before_compiling
     from swath.daemon.processing.live.session import Live
+    from swath.daemon.processing.setup.sent_files import example_files
     from swath.daemon.processing.setup.setup import Options, Setup
     from swath.daemon.processing.warm_up import get_ready, warm_up
     from swath.daemon.recorder.service_manager import ServiceManager
@@ -133,7 +134,9 @@ def _follow(
     manager = ServiceManager()
     manager.notify(STATUS="compiling")
     with before_compiling(_tell_of_compiling):
-        warmed = warm_up([] if config is None else [Setup.of_config(config, Options(uncertainty=False))])
+        warmed = warm_up(
+            [] if config is None else [Setup.of_config(config, Options(uncertainty=False), example_files(config))]
+        )
     with _stop_signals() as stop, _teller(Console(), manager, as_json=as_json) as tell:
         if warmed.cache is None or warmed.compiled:
             print(one_line(warmed.text()), file=sys.stderr, flush=True)
@@ -242,7 +245,7 @@ def _replay(
         )
     config: Config | None = load_config(configs[0]) if configs else None
     options = Options(uncertainty=False)
-    setup = Setup.of_log(sessions[0].attachments(), options) if config is None else Setup.of_config(config, options)
+    setup = Setup.of_session(sessions[0], config, options)
     live: LiveConfig = setup.config.tables.live
     found = replay(sessions[0], setup, output, live, points, accept_verdict=accept_verdict)
     print(json.dumps(found, indent=2) if as_json else found["sentence"])

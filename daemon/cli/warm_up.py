@@ -24,10 +24,14 @@ def command(
     require_installed("swath warm-up")
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.config import load_config
+    from swath.daemon.processing.setup.sent_files import example_files
     from swath.daemon.processing.setup.setup import Options, Setup
     from swath.daemon.processing.warm_up import warm_up
 
-    setups = [] if config is None else [Setup.of_config(load_config(config), Options(uncertainty=False))]
+    setups: list[Setup] = []
+    if config is not None:
+        loaded = load_config(config)
+        setups.append(Setup.of_config(loaded, Options(uncertainty=False), example_files(loaded)))
     with progress_bar() as tell:
         done = warm_up(setups, calibration=True, tell=tell)
     print(done.text(), flush=True)

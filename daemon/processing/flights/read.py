@@ -223,10 +223,7 @@ def read_flights(request: GeorefOptions, tell: Tell, check: Check = lambda sessi
 def _setup(request: GeorefOptions, session: Session) -> Setup:
     config = request.config
     try:
-        if config is None:
-            setup = Setup.of_log(session.attachments(), request.options)
-        else:
-            setup = Setup.of_config(config, request.options)
+        setup = Setup.of_session(session, config, request.options)
     except UserError as error:
         if isinstance(error.__cause__, UnknownCrsError):
             error = _with_likely_crs(error.__cause__, session, config)

@@ -59,6 +59,7 @@ def settings_entry(setup: Setup) -> dict[str, Any]:
         "attitude": config.attitude.model_dump(mode="json"),
         "mta": config.mta.model_dump(mode="json"),
         "scanners": {name: config.scanner[name].model_dump(mode="json", exclude_none=True) for name in setup.scanners},
+        "geometry_from_log": sorted(setup.sources.sent),
         "gnss": {
             name: {"lever_arm_m": list(gnss.lever_arm_m), "datum": gnss.datum} for name, gnss in config.gnss.items()
         },

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +19,13 @@ from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.reader import Session
 from swath.daemon.log.session import read_boot_id
 from swath.daemon.processing.carried_verdict import calibration_verdicts, verdict_entry
-from swath.daemon.processing.live.follow import LiveFollower, Skipped
+from swath.daemon.processing.live.follow import LiveFollower, LivePart, Skipped
 from swath.daemon.processing.live.points import PointsFile
 from swath.daemon.processing.live.products import LiveProducts, Room
 from swath.daemon.processing.live.status import LiveStatus, sentence, write_status
 from swath.daemon.processing.points.feed import LogFeed, Placed
-from swath.daemon.processing.setup.setup import Options, Setup
+from swath.daemon.processing.setup.sent_files import SentFiles
+from swath.daemon.processing.setup.setup import Options, Setup, config_in_log
 from swath.georef.arrays import StructArray
 from swath.georef.trajectory.trajectory import Trajectory
 
@@ -32,6 +33,7 @@ FOLDER = "live"  # in the log directory
 POLL_S = 0.05
 STATUS_S = 1.0
 COVERAGE_S = 10.0
+SENT_WAIT_NS = 10_000_000_000  # how long a recording may go on until its scanners have sent their angles
 
 Told = dict[str, Any]
 
@@ -172,6 +174,8 @@ class Live:
         self._prepare = prepare
         self._follower = LiveFollower(directory, from_start=from_start)
         self._session: LiveSession | None = None
+        self._sent: SentFiles | None = None
+        self._held: list[LogBatch] = []
         self._told_s = self._covered_s = -COVERAGE_S
         self._trouble = ""
 
@@ -199,20 +203,34 @@ class Live:
         part = self._follower.part
         if isinstance(item, Skipped) or part is None:
             return  # the gap looks like a hole in the log to the stream; the follower counts it
-        if self._session is None:
-            setup = Setup.of_log(part.attachments, Options(uncertainty=False))
-            if self._prepare is not None:
-                self._prepare(setup)
-            self._session = made_session(
-                setup,
-                part.info,
-                self._directory / FOLDER,
-                self._live,
-                self._points,
-                beside_recorder=True,
-                accept_verdict=self._accept_verdict,
-            )
-        self._session.take(item, live=True)
+        if self._session is not None:
+            self._session.take(item, live=True)
+            return
+        if self._sent is None:
+            self._sent = SentFiles(config_in_log(part.attachments))
+        self._held.append(item)
+        self._sent.take(item)
+        waited_ns = int(item.log_time_ns[-1]) - int(self._held[0].log_time_ns[0])
+        if not self._sent.missing or waited_ns > SENT_WAIT_NS:
+            self._begin(part, self._sent.found)
+
+    def _begin(self, part: LivePart, sent: Mapping[str, bytes]) -> None:
+        """Begin the session with the messages that waited for what the scanners send."""
+        setup = Setup.of_log(part.attachments, Options(uncertainty=False), sent)
+        if self._prepare is not None:
+            self._prepare(setup)
+        self._session = made_session(
+            setup,
+            part.info,
+            self._directory / FOLDER,
+            self._live,
+            self._points,
+            beside_recorder=True,
+            accept_verdict=self._accept_verdict,
+        )
+        held, self._held = self._held, []
+        for batch in held:
+            self._session.take(batch, live=True)
 
     def _look_at_clock(self) -> None:
         """Report the status once a second, and save the coverage now and then."""
@@ -225,7 +243,10 @@ class Live:
             if now_s - self._covered_s > COVERAGE_S:
                 self._covered_s = now_s
                 self._session.products.save_coverage(self._about())
-        self._say("following" if self._session is not None else "waiting for a recording to begin")
+        waiting = "waiting for a recording to begin"
+        if self._held and self._sent is not None:
+            waiting = f"waiting for the angles of scanner {', '.join(self._sent.missing)}"
+        self._say("following" if self._session is not None else waiting)
 
     def _about(self) -> Told:
         part = self._follower.part
@@ -247,6 +268,9 @@ class Live:
         return found
 
     def _end(self) -> Told:
+        part = self._follower.part
+        if self._held and part is not None and self._sent is not None:
+            self._begin(part, self._sent.found)
         if self._session is not None:
             self._session.close(live=True)
             self._session.products.save_coverage(self._about())

@@ -18,6 +18,7 @@ from swath.daemon.config.tables import ScannerConfig
 from swath.daemon.errors import ConfigError, UserError
 from swath.daemon.log.format import LogError, SessionInfo
 from swath.daemon.log.parsers import stored_config
+from swath.daemon.log.reader import Session
 from swath.daemon.processing.setup.models import (
     TerrainRanges,
     calibration_mistakes,
@@ -26,6 +27,7 @@ from swath.daemon.processing.setup.models import (
     make_resolver,
     refuse_logged_gimbals,
 )
+from swath.daemon.processing.setup.sent_files import sent_file_of, sent_files
 from swath.daemon.processing.setup.sources import Sources
 from swath.daemon.processing.setup.terrain import terrain_of
 from swath.drivers.parser import Parser
@@ -71,6 +73,21 @@ class Options:
     height_above_ground_m: float | None = None
 
 
+def config_in_log(attachments: Mapping[str, bytes]) -> Config:
+    """Return the configuration that is stored in a log.
+
+    Raises:
+        UserError: the log has none, or one of another version.
+    """
+    try:
+        config = stored_config(attachments)
+    except LogError as error:
+        raise UserError(f"{error}; give another with --config, to swath live --replay as CONFIG") from error
+    if config is None:
+        raise UserError("the log holds no configuration; give one with --config, to swath live --replay as CONFIG")
+    return config
+
+
 class Setup:
     """Everything that one log's georeferencing needs; pickles.
 
@@ -81,8 +98,20 @@ class Setup:
         sources: the devices; angles of gimbals are given by `take_angles`.
     """
 
-    def __init__(self, config: Config, attachments: Mapping[str, bytes], options: Options | None = None) -> None:
-        """Build the setup; ``attachments`` are the files that the configuration names, by their names in a log.
+    def __init__(
+        self,
+        config: Config,
+        attachments: Mapping[str, bytes],
+        options: Options | None = None,
+        sent: Mapping[str, bytes] | None = None,
+    ) -> None:
+        """Build the setup.
+
+        Args:
+            config: configuration of the log, or another one.
+            attachments: the files that the configuration names, by their names in a log.
+            options: of the command.
+            sent: what scanners sent in place of their ``geometry.file``, by name; see `sent_files`.
 
         Raises:
             ConfigError: a setting is invalid.
@@ -90,31 +119,43 @@ class Setup:
         self.config = config
         self.options = options or Options()
         self.scanners = self._chosen()
-        self.sources = Sources(config, attachments, self.scanners)
+        self.sources = Sources(config, attachments, self.scanners, sent)
         self.calibrations = {name: self._calibration(name) for name in self.scanners}
         self.mapping = self._mapping()
         self.terrain = self.options.terrain or terrain_of(config)
         self._georeferencers = self._made(None)
 
     @classmethod
-    def of_log(cls, attachments: Mapping[str, bytes], options: Options | None = None) -> Setup:
+    def of_log(
+        cls, attachments: Mapping[str, bytes], options: Options | None = None, sent: Mapping[str, bytes] | None = None
+    ) -> Setup:
         """Make the setup from the configuration that is stored in a log.
 
         Raises:
             UserError: the log has no configuration, or one that cannot be used.
         """
-        try:
-            config = stored_config(attachments)
-        except LogError as error:
-            raise UserError(f"{error}; give another with --config, to swath live --replay as CONFIG") from error
-        if config is None:
-            raise UserError("the log holds no configuration; give one with --config, to swath live --replay as CONFIG")
-        return cls(config, attachments, options)
+        return cls(config_in_log(attachments), attachments, options, sent)
 
     @classmethod
-    def of_config(cls, config: Config, options: Options | None = None) -> Setup:
+    def of_session(cls, session: Session, config: Config | None, options: Options | None = None) -> Setup:
+        """Make the setup from a log, with its own configuration or another one, and with what scanners sent in it.
+
+        Raises:
+            UserError: as for `of_log`; LogError, OSError: the log cannot be read.
+        """
+        scanners = () if options is None else options.scanners
+        if config is not None:
+            return cls.of_config(config, options, sent_files(session, config, scanners))
+        attachments = session.attachments()
+        config = config_in_log(attachments)
+        return cls(config, attachments, options, sent_files(session, config, scanners))
+
+    @classmethod
+    def of_config(
+        cls, config: Config, options: Options | None = None, sent: Mapping[str, bytes] | None = None
+    ) -> Setup:
         """Make the setup from a configuration and the files beside it."""
-        return cls(config, {name: data for name, _, data in config.attachments()}, options)
+        return cls(config, {name: data for name, _, data in config.attachments()}, options, sent)
 
     def _chosen(self) -> list[str]:
         known = sorted(self.config.scanner)
@@ -200,6 +241,12 @@ class Setup:
         return {name: self._georeferencer(name, parsers[f"scanner/{name}"], angles) for name in self.scanners}
 
     def _georeferencer(self, name: str, parser: Parser, angles: Mapping[str, AngleSeries] | None) -> Any:
+        sent = sent_file_of(self.config.scanner[name])
+        if sent is not None and name not in self.sources.sent:
+            raise ConfigError(
+                f"scanner.{name}: no {sent.what} of the head was received, which states the angles of its beams; give "
+                "geometry.file (after the flight in a configuration with --config), and record the port (auxiliary)"
+            )
         try:
             return make_georeferencer(
                 self.config,

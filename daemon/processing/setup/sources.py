@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from swath.daemon.config.config import PARSER_FILES, Config, DeviceTable, attachment_name
-from swath.daemon.config.tables import GnssConfig, ImuConfig
+from swath.daemon.config.tables import GnssConfig, ImuConfig, ScannerConfig
 from swath.daemon.errors import ConfigError
 from swath.daemon.log.format import SessionInfo
 from swath.daemon.processing.setup.models import gimbal_sources
@@ -30,12 +30,19 @@ class Sources:
         config: configuration of the log, or another one.
         attachments: the files that the configuration names, by their names in a log.
         scanners: names of the scanners that are read.
+        sent: content that scanners themselves sent in place of their ``geometry.file``, by name.
         gimbal_sources: sources of gimbals' angles; they do not give the aircraft's position.
         ins_source: source of the INS solutions for the growing trajectory: the first IMU whose protocol has them, else
             the first receiver; None: there is no such source.
     """
 
-    def __init__(self, config: Config, attachments: Mapping[str, bytes], scanners: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        config: Config,
+        attachments: Mapping[str, bytes],
+        scanners: Sequence[str] = (),
+        sent: Mapping[str, bytes] | None = None,
+    ) -> None:
         """Find the source of each kind of data.
 
         Raises:
@@ -44,6 +51,7 @@ class Sources:
         self.config = config
         self.attachments = dict(attachments)
         self.scanners = list(scanners)
+        self.sent = dict(sent or {})
         self.gimbal_sources = {source for name in self.scanners for _, source in gimbal_sources(config, name)}
         self.ins_source = self._ins_source()
 
@@ -152,6 +160,8 @@ class Sources:
             stored = self.attachments.get(attachment_name(key, name, path))
             if key in PARSER_FILES and stored is not None:
                 found[key] = stored
+        if isinstance(table, ScannerConfig) and name in self.sent and "geometry" not in self.config.files_of(table):
+            found["geometry"] = self.sent[name]
         return found
 
     def _driver(self, kind: DeviceKind, name: str, table: DeviceTable) -> Driver:

@@ -16,8 +16,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
-from swath.drivers.driver import Driver
-from swath.drivers.parser import DeviceSettings, DriverSettingsError, PacketParser, Parser
+from swath.drivers.driver import Driver, SentFile
+from swath.drivers.parser import DeviceSettings, PacketParser, Parser
 from swath.drivers.scanner.beams import BeamTable
 from swath.drivers.scanner.robosense.heads import (
     BLOCK_ID,
@@ -114,36 +114,29 @@ class RobosenseParser(PacketParser):
     """Decodes data and device information packets of one head, distinguished by their first bytes.
 
     Counts ``bad_length``, ``bad_header``, ``wrong_product`` (another model answers), ``bad_block``, ``bad_azimuth``,
-    ``bad_time``, ``angles_differ`` (a device information packet states other angles than the file) and
-    ``no_angles``.
+    ``bad_time``, ``angles_differ`` (a device information packet states other angles than those in use), ``no_angles``,
+    and, without a file, ``before_difop`` (data packets before the first device information packet with angles).
 
     Args:
-        settings: file ``geometry`` is a DIFOP packet or a table of angles.
+        settings: file ``geometry`` is a DIFOP packet or a table of angles; without it, the first DIFOP packet counts.
         head: the model.
         clock_only: return no returns, and clock samples of one data packet in 50 ms of host time.
-        probe: do without the file, to recognise the head.
 
     Attributes:
-        beams: the head's beams.
+        beams: the head's beams; None until they are known. Returns do not depend on them.
 
     Raises:
-        DriverSettingsError: the file is missing or unusable.
+        DriverSettingsError: the file is unusable.
     """
 
-    def __init__(
-        self, settings: DeviceSettings, head: RobosenseHead, *, clock_only: bool = False, probe: bool = False
-    ) -> None:
+    def __init__(self, settings: DeviceSettings, head: RobosenseHead, *, clock_only: bool = False) -> None:
         super().__init__()
-        self._elevation: FloatArray
-        self._azimuth: FloatArray
-        if "geometry" in settings.files:
-            self._elevation, self._azimuth, self._mode = read_angles(settings.files["geometry"], head)
-        elif probe:
-            self._elevation, self._azimuth, self._mode = np.linspace(-15, 15, head.lasers), np.zeros(head.lasers), -1
-        else:
-            raise DriverSettingsError(f"{FILE}: missing; give a DIFOP packet of the head or a table of its angles")
         self._head, self._source = head, settings.source
-        self.beams: BeamTable = head.beams(self._elevation, self._azimuth)
+        self._angles: tuple[FloatArray, FloatArray] | None = None
+        self._mode = -1
+        if "geometry" in settings.files:
+            *angles, self._mode = read_angles(settings.files["geometry"], head)
+            self._angles = angles[0], angles[1]
         self._thinner = SampleThinner() if clock_only else None
         self._fill = filler(compiled=settings.compiled and not clock_only)
         self._packets = 0
@@ -166,11 +159,26 @@ class RobosenseParser(PacketParser):
             records += read(host_time_ns[start:stop], units[start:stop])
         return records
 
+    @property
+    def beams(self) -> BeamTable | None:
+        """The head's beams; None until they are known."""
+        return None if self._angles is None else self._head.beams(*self._angles)
+
     def remarks(self) -> list[str]:
-        """Return what to do where the head states other angles than the file."""
+        """Return what to do where the head states other angles than those in use."""
         if not self.counters.errors["angles_differ"]:
             return []
-        return [f"{self._source}: its DIFOP packets state other angles than {FILE}; give one of them as the file"]
+        return [
+            f"{self._source}: its DIFOP packets state other angles than {FILE}, or without it than the first of them; "
+            "give one of them as the file"
+        ]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """A line if the angles of the beams are unknown."""
+        if self._angles is not None or not self.counters.messages["data"]:
+            return ()
+        return (f"no DIFOP packet (port 7788) stated the angles of its beams; set auxiliary, or give {FILE}",)
 
     def _information(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
         packets = units.view(DIFOP_DTYPE)[:, 0]
@@ -181,7 +189,9 @@ class RobosenseParser(PacketParser):
             angles = self._head.angles(packet)
             if angles is None:
                 self.counters.errors["no_angles"] += 1
-            elif not (self._is_same(angles[0], self._elevation) and self._is_same(angles[1], self._azimuth)):
+            elif self._angles is None:
+                self._angles = angles
+            elif not all(map(self._is_same, angles, self._angles)):
                 self.counters.errors["angles_differ"] += 1
             self._mode = int(packet["mode"])
             status = (self._mode, int(packet["rpm"]))
@@ -204,6 +214,8 @@ class RobosenseParser(PacketParser):
         self.counters.bytes_skipped += int((~good).sum()) * PACKET_BYTES
         if not good.any():
             return []
+        if self._angles is None:
+            self.counters.errors["before_difop"] += int(good.sum())
         host_time_ns, packets, stamp_ns = host_time_ns[good], packets[good], stamp_ns[good]
         chosen = slice(None) if self._thinner is None else self._thinner.choose(host_time_ns)
         dual = self._duals(packets)
@@ -371,8 +383,23 @@ def _azimuths(azimuth: FloatArray, gap: FloatArray, passed: FloatArray) -> Calla
     return made_of
 
 
-def _maker(head: RobosenseHead, *, clock_only: bool = False, probe: bool = False) -> Callable[[DeviceSettings], Parser]:
-    return lambda settings: RobosenseParser(settings, head, clock_only=clock_only, probe=probe)
+def _maker(head: RobosenseHead, *, clock_only: bool = False) -> Callable[[DeviceSettings], Parser]:
+    return lambda settings: RobosenseParser(settings, head, clock_only=clock_only)
+
+
+def _finder(head: RobosenseHead) -> Callable[[ByteRows], bytes | None]:
+    """Return a function for the first device information packet with angles of a head among units."""
+
+    def find(units: ByteRows) -> bytes | None:
+        if units.shape[1] != PACKET_BYTES:
+            return None
+        for row in np.flatnonzero((units[:, : len(_DIFOP_START)] == _DIFOP_START).all(axis=1)).tolist():
+            unit: bytes = units[row].tobytes()
+            if head.angles(np.frombuffer(unit, dtype=DIFOP_DTYPE)[0]) is not None:
+                return unit
+        return None
+
+    return find
 
 
 def _driver(protocol: str, head: RobosenseHead) -> Driver:
@@ -381,14 +408,16 @@ def _driver(protocol: str, head: RobosenseHead) -> Driver:
         kind="scanner",
         transports=("udp",),
         yields=(ScannerReturns, DeviceClockSamples, DeviceStatus),
-        summary=f"RoboSense {head.name}: single and dual return, angles of its DIFOP packet",
+        summary=f"RoboSense {head.name}: single and dual return, angles of its DIFOP packets",
         make_parser=_maker(head),
         make_time_parser=_maker(head, clock_only=True),
-        make_probe=_maker(head, probe=True),
         tells_pps=False,
-        needs=("installation", "geometry.file"),
+        needs=("installation",),
         wavelength_nm=905.0,
         eight_bit_intensity=True,
+        sent_file=SentFile(
+            "DIFOP packet", _finder(head), lambda: encode_difop(head, np.linspace(-15, 15, head.lasers))
+        ),
     )
 
 

@@ -145,6 +145,7 @@ def test_points_start_ahead_of_the_axis() -> None:
     azimuth, elevation, distance_m = np.radians(30.0), np.radians(-25.0), 5.0
     forward = distance_m * np.cos(elevation) * np.cos(azimuth + np.radians(8)) + 0.03997 * np.cos(azimuth)
     left = -distance_m * np.cos(elevation) * np.sin(azimuth + np.radians(8)) - 0.03997 * np.sin(azimuth)
+    assert parser.beams is not None
     np.testing.assert_allclose(
         beam_points(row, parser.beams)[0], [-left, forward, distance_m * np.sin(elevation)], atol=1e-9
     )
@@ -215,9 +216,55 @@ def test_other_angles_of_the_head_are_reported() -> None:
         {"return_mode": 2, "motor_rpm": 600},
     ]
     assert parser.remarks() == [
-        "scanner/left: its DIFOP packets state other angles than geometry.file; give one of them as the file"
+        "scanner/left: its DIFOP packets state other angles than geometry.file, or without it than the first of them; "
+        "give one of them as the file"
     ]
     assert parser_of(RS32).remarks() == []
+
+
+def difop_by_hand() -> bytes:
+    """Return a DIFOP packet of an RS-LiDAR-32: at 468 a sign and two bytes of 0.001° upwards for each of 32 lasers, at
+    564 the same of the azimuth (RSCalibrationAngle of decoder.hpp, AdapterDifopPkt of decoder_RS32.hpp).
+    """
+    upward = b"".join(struct.pack(">BH", int(laser < 16), 1000 + 100 * laser) for laser in range(32))
+    turned = b"".join(struct.pack(">BH", laser % 2, 8_000) for laser in range(32))
+    head = bytes.fromhex("a5ff005a11115555") + struct.pack(">H", 600)
+    unit = head.ljust(300, b"\0") + b"\x02"
+    unit = unit.ljust(468, b"\0") + upward + turned
+    return unit.ljust(1246, b"\0") + b"\x0f\xf0"
+
+
+def test_the_heads_own_packets_give_the_angles_without_a_file() -> None:
+    """Returns before the packet are decoded and counted; the first packet counts, a later one is compared with it."""
+    parser = RobosenseParser(DeviceSettings("scanner/left"), RS32)
+    before = returns_of(feed(parser, [packet(RS32)] * 3))
+    assert len(before) == 3 * 384
+    assert (before["flags"] == 0).all()  # the return mode is not known yet
+    assert parser.beams is None
+    assert len(parser.warnings) == 1
+    assert "no DIFOP packet" in parser.warnings[0]
+    after = returns_of(feed(parser, [difop_by_hand(), packet(RS32), encode_difop(RS32, angles(RS32))]))
+    assert (after["flags"] == RETURN_FLAG_LAST).all()
+    assert parser.counters.errors == {"before_difop": 3, "angles_differ": 1}
+    assert parser.beams is not None
+    assert parser.warnings == ()
+    np.testing.assert_allclose(parser.beams.elevation_deg[[0, 15, 16, 31]], [-1, -2.5, 2.6, 4.1], atol=1e-9)
+    np.testing.assert_allclose(parser.beams.azimuth_deg[:2], [8, -8], atol=1e-9)
+
+
+@EVERY_HEAD
+def test_the_packet_with_the_angles_is_found_among_others(head: RobosenseHead) -> None:
+    """Packets of other models hold no angles of this one, or none at all; a log may hold them too."""
+    protocol = next(f"robosense-{name}" for name, one in HEADS.items() if one is head)
+    sent = find_driver("scanner", protocol).sent_file
+    assert sent is not None
+    other = encode_difop(RS32 if head is RS16 else RS16, angles(RS32 if head is RS16 else RS16))
+    own, later = encode_difop(head, angles(head), mode=2), encode_difop(head, np.array(angles(head)) / 2)
+    units = np.frombuffer(b"".join([packet(head), other, own, later]), dtype=np.uint8).reshape(4, -1)
+    assert sent.find(units) == own
+    assert sent.find(units[:2]) is None
+    assert sent.find(units[:, 1:]) is None
+    read_angles(sent.example(), head)
 
 
 # --- every head
@@ -274,14 +321,11 @@ def test_impossible_packets_are_counted(at: int, new: bytes, code: str) -> None:
 def test_the_driver_declares_its_records(name: str) -> None:
     head, driver = HEADS[name], find_driver("scanner", f"robosense-{name}")
     units = [unit for unit in payloads("robosense/made.pcap.gz") if unit[: len(head.identity)] == head.identity]
-    with pytest.raises(DriverSettingsError, match=r"geometry\.file: missing"):
-        driver.make_parser(DeviceSettings("scanner/left"))
     file = DeviceSettings("scanner/left", {}, {"geometry": (FIXTURES / "robosense" / f"{name}.difop").read_bytes()})
     assert driver.make_time_parser is not None
-    assert driver.make_probe is not None
     records = feed(driver.make_time_parser(file), units)
     assert {type(record) for record in records} == {DeviceClockSamples}
     assert len(clock_of(records)) < len(units)
-    probe = driver.make_probe(DeviceSettings("scanner/left"))
-    assert len(returns_of(feed(probe, units))) > 1000
-    assert probe.counters.messages["data"] >= 20
+    bare = driver.make_parser(DeviceSettings("scanner/left"))
+    assert len(returns_of(feed(bare, units))) > 1000
+    assert bare.counters.messages["data"] >= 20
