@@ -30,6 +30,8 @@ _LABELS: dict[str, tuple[str, str]] = {  # words, symbol
 }
 _UNITS = {"deg": "°", "m": "m", "ppm": "ppm", "us": "µs", "us2": "µs²"}
 _BY_NAME = {parameter.name: parameter for parameter in PARAMETERS}
+_BY_KEY = {parameter.key: parameter.name for parameter in PARAMETERS}
+_KEYS = re.compile(rf"\b(?:{'|'.join(sorted(_BY_KEY, key=len, reverse=True))})\b")
 _NAMED = re.compile(rf"\b([\w-]+)\.({'|'.join(sorted(_LABELS, key=len, reverse=True))})\b")
 _SUFFIXES = (("_rad", "°", 180.0 / math.pi), ("_m", "m", 1.0), ("_s", "µs", 1e6))
 
@@ -82,6 +84,11 @@ def words_of(scanner: str, name: str, *, several: bool) -> str:
 def plain(text: str, *, several: bool) -> str:
     """Replace parameter names such as ``left.omega_rad`` in a sentence by their words."""
     return _NAMED.sub(lambda found: words_of(found[1], found[2], several=several), text)
+
+
+def worded(text: str) -> str:
+    """Replace the keys of parameters in a sentence, such as ``omega_deg``, by their words."""
+    return _KEYS.sub(lambda found: _LABELS[_BY_KEY[found[0]]][0], text)
 
 
 def is_undetermined(held: FixedParameter) -> bool:

@@ -82,7 +82,9 @@ def command(
     for line in warnings:
         print(one_line(f"swath: {line}"), file=sys.stderr)
     if planned.lacking:
-        raise UserError(one_line(f"{plan}: {planned.sentence}"))
+        if as_json:
+            raise UserError(one_line(f"{plan}: {planned.sentence}"))
+        raise typer.Exit(int(ExitCode.PROBLEM))  # stdout has the verdict
 
 
 def _write(planned: PlannedCalibration, path: Path, warnings: list[str]) -> list[Path]:

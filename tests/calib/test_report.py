@@ -30,7 +30,13 @@ from swath.daemon.processing.calibration.report.cuts import cuts_of
 from swath.daemon.processing.calibration.report.maps import plane_means_m
 from swath.daemon.processing.calibration.report.page import html, paper_page, pdf
 from swath.daemon.processing.calibration.report.residuals import residual_picture, seen_of
-from swath.daemon.processing.calibration.report.tables import entries_table, held_table, parameter_tables
+from swath.daemon.processing.calibration.report.tables import (
+    control_table,
+    entries_table,
+    groups_table,
+    held_table,
+    parameter_tables,
+)
 from swath.daemon.processing.pages.canvas import NARROW
 from swath.georef.verdicts import Level
 from tests.calib.made_outcome import RISE, Outcome, made_report
@@ -278,6 +284,27 @@ def test_the_page_needs_no_network(page: str) -> None:
 
 def test_the_page_has_no_empty_heads_or_columns_and_real_minus_signs(page: str) -> None:
     assert faults_of(page) == []
+
+
+def test_control_is_told_as_the_laser_above_it_as_everywhere(report: ReportInput) -> None:
+    """`swath validate` and the layer of control of `swath view --gis` give laser less survey, up positive."""
+    point, table = report.adjusted.control[0], control_table(report)
+    assert table is not None
+    assert table.heads[1] == "laser above it, cm"
+    assert table.rows[0][1] == number(-100.0 * point.misclosure_m, "+.1f")
+    assert table.rows[0][3] == number(-point.normalised, "+.2f")
+
+
+def test_a_group_of_several_units_has_no_rms(report: ReportInput) -> None:
+    groups = tuple(GroupFit(group, 400, 350.2, 1.0, 0.02, 0) for group in ("planes", "trajectory", "priors"))
+    rows = groups_table(replace(report, adjusted=replace(report.adjusted, groups=groups))).rows
+    assert [row[2:5:2] for row in rows] == [["350", "2.0\u00a0cm"], ["350", "–"], ["350", "–"]]
+
+
+def test_a_note_that_stands_with_the_settings_is_not_repeated(report: ReportInput) -> None:
+    note = "sigmas of the trajectory, correlated in time: position 60 s; 12 knots, 5 s apart"
+    told = replace(report, notes=[*report.notes, note], settings={"trajectory errors": f"as given; {note}"})
+    assert html(told).count("position 60\u00a0s") == 1
 
 
 def test_the_page_has_all_its_parts(page: str) -> None:

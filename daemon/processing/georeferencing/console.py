@@ -33,7 +33,7 @@ def georef_lines(record: Mapping[str, Any], elapsed_s: float) -> Iterator[str]:
     yield from (f"warning: {line}" for line in record["warnings"])
     flights = record["flights"]
     yield from dict.fromkeys(
-        f"calibration: {calibration_words(name, {'verdict': 'good'} | calibration)}"
+        f"calibration: {calibration_words(name, calibration, unsaid='good')}"
         for flight in flights
         for name, calibration in flight["calibrations"].items()
     )

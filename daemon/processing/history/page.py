@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from swath.calib.labels import unknown
+from swath.calib.labels import unknown, worded
 from swath.calib.validation.courses import Course, ScannerCourse, Step
 from swath.calib.validation.history import date_words
 from swath.daemon.errors import ExitCode, UserError
@@ -121,7 +121,7 @@ def _of_scanner(one: ScannerCourse, *, several: bool) -> Iterator[Block]:
 
 def _change_cell(step: Step) -> str | Judged:
     """Return what changed; after a new mounting a change is expected, and no colour judges it."""
-    words = step.words.partition(": ")[2]
+    words = worded(step.words.partition(": ")[2])
     return words if step.remounted or step.compared is None else Judged(words, good=not step.changed)
 
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, TypeAlias
 
+from swath.calib.labels import worded
 from swath.georef.verdicts import Verdict
 
 
@@ -113,7 +114,7 @@ class Image:
 
 def reasons_of(verdict: Verdict) -> list[Block]:
     """Return a table of the reasons of a verdict with their remedies, without those that its sentence tells wholly."""
-    rows = [[one.what, one.change] for one in verdict.reasons if one.change or one.what not in verdict.sentence]
+    rows = [[worded(one.what), one.change] for one in verdict.reasons if one.change or one.what not in verdict.sentence]
     return [Table("Reasons", ("reason", "remedy"), rows, left=(0, 1), stacked=True)] if rows else []
 
 

@@ -87,10 +87,16 @@ def _utc_words(gps_ns: int, *, seconds: bool) -> tuple[str, str]:
     return date.isoformat(), f"{minutes // 60:02d}:{minutes % 60:02d}" + (f":{second:02d}" if seconds else "")
 
 
-def calibration_words(scanner: str, entry: Mapping[str, Any]) -> str:
-    """Return id, scanner, date and verdict of a calibration, from the header of its file or its entry in a sidecar."""
+def calibration_words(scanner: str, entry: Mapping[str, Any], unsaid: str = "") -> str:
+    """Return id, scanner, date and verdict of a calibration.
+
+    Args:
+        scanner: its name.
+        entry: header of the calibration's file, or its entry in a sidecar.
+        unsaid: verdict on an estimated calibration whose file has none.
+    """
     created = entry.get("created")
-    verdict = entry.get("verdict") or ("nominal, never estimated" if entry.get("method") == "nominal" else "")
+    verdict = entry.get("verdict") or ("nominal, never estimated" if entry.get("method") == "nominal" else unsaid)
     words = [str(entry.get("id", "")), f"of {scanner}" if scanner else ""]
     said = [f"made {str(created)[:10]}" if created else "", str(verdict)]
     return ", ".join([" ".join(filter(None, words)), *filter(None, said)])

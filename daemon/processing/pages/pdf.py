@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +16,6 @@ from swath.daemon.processing.pages.names import PRINTED
 
 FACES = (("DejaVu Sans", "normal"), ("DejaVu Sans", "bold"), ("DejaVu Sans Mono", "normal"))
 DATE = "SOURCE_DATE_EPOCH"
-BEFORE_UNIT = re.compile(r"(?<=\d) (?=(?:[ckm]?m|km²|m²|[µm]?s|min|h|ppm|mdeg|mrad|Hz|MB|GB|%|σ|sigmas?)(?![\w]))")
 NO_PANGO = "because Pango is missing: apt-get install libpango-1.0-0 libpangoft2-1.0-0"
 
 
@@ -51,9 +49,7 @@ def pdf_of(page: str) -> bytes:
     weasyprint, fonts = _printer()
     faces = weasyprint.CSS(string=_font_faces(), font_config=fonts)
     with _fixed_date():
-        printed = weasyprint.HTML(string=BEFORE_UNIT.sub("\u00a0", page)).write_pdf(
-            stylesheets=[faces], font_config=fonts
-        )
+        printed = weasyprint.HTML(string=page).write_pdf(stylesheets=[faces], font_config=fonts)
     return bytes(printed)
 
 

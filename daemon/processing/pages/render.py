@@ -16,6 +16,7 @@ from swath.daemon.processing.pages.head import PageHead
 from swath.georef.verdicts import Verdict
 
 STYLE_SHEET, TEMPLATE = "page.css", "base.html"
+BEFORE_UNIT = re.compile(r"(?<=\d) (?=(?:[ckm]?m|km²|m²|[µm]?s|min|h|ppm|mdeg|mrad|Hz|MB|GB|%|σ|sigmas?)(?![\w]))")
 HYPHEN_AS_MINUS = re.compile(r"(?<![\w=.,/\-])-(?=\d)")  # not that of dates, names and definitions of CRS
 
 
@@ -57,16 +58,19 @@ def environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
         keep_trailing_newline=True,
-        finalize=_with_minus,
+        finalize=_typeset,
     )
     style, _, _ = loader.get_source(made, STYLE_SHEET)
     made.globals["style"] = Markup(style)
     return made
 
 
-def _with_minus(value: Any) -> Any:
-    """Return a text with real minus signs before numbers; texts of other programs and of scripts write hyphens."""
-    return HYPHEN_AS_MINUS.sub("−", value) if type(value) is str else value
+def _typeset(value: Any) -> Any:
+    """Return a text with real minus signs before numbers, and with units that stay on the line of their number.
+
+    Texts of other programs and of scripts have hyphens and plain spaces there.
+    """
+    return BEFORE_UNIT.sub("\u00a0", HYPHEN_AS_MINUS.sub("−", value)) if type(value) is str else value
 
 
 def render(template: str, **values: Any) -> str:

@@ -178,7 +178,7 @@ def _cm(metres: float | None) -> str:
 
 
 def _percent(share: float) -> str:
-    return f"{100 * math.floor(share * 1e4) / 1e4:.2f} %"  # 100 % only if it is all
+    return f"{math.floor(share * 1e3) / 10:.1f} %"  # 100 % only if it is all
 
 
 def _pairs(look: Look) -> list[Block]:
@@ -214,7 +214,7 @@ def _strips(look: Look) -> Table:
         elif sigmas:
             row += ["–"] * 4
         rows.append(row)
-    under = "Sigmas: root mean square over the strip's points, as the files say them." if sigmas else ""
+    under = "Sigmas: root mean square over the strip's points, as stored in the files." if sigmas else ""
     return _table("Strips", heads, rows, under)
 
 

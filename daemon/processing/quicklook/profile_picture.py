@@ -107,7 +107,7 @@ def _words(figure: Figure, axes: Axes, look: Look, profile: Profile) -> None:
         *ends,
         f"{thousands(line.length_m)} m long, {2 * line.half_width_m:g} m wide",
         f"{thousands(len(profile.along_m))}{'' if profile.complete else ' of the first'} points",
-        f"heights {exaggeration:.3g} × exaggerated" if exaggeration >= 1.05 else "",
+        f"heights {float(f'{exaggeration:.2g}'):g} × exaggerated" if exaggeration >= 1.05 else "",
     ]
     figure.text(0.02, 0.955, f"Profile {line.title}", fontsize=15, weight="bold", color=INK, va="center")
     text = "   ·   ".join(words for words in parts if words)

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from swath.calib.labels import decimals_of, number, thousands
+from swath.calib.labels import decimals_of, number, thousands, words_of
 from swath.calib.strips.signatures import MATTERS_M, SIGNIFICANT, Signature
 from swath.calib.strips.standards import TO_CONFIRM
 from swath.daemon.errors import ExitCode, UserError
@@ -215,9 +215,10 @@ def _causes(now: Judgement) -> list[Block]:
 
 def _effect(one: Signature) -> list[Cell]:
     effect = one.effect
+    parameter = words_of("", effect.parameter, several=False)
     if not math.isfinite(one.value):
         why = one.words.partition(": ")[2] or one.words
-        return [effect.name, effect.key, "–", "–", "–", "–", f"{LEVEL_WORDS.get(one.level, one.level)}: {why}"]
+        return [effect.name, parameter, "–", "–", "–", "–", f"{LEVEL_WORDS.get(one.level, one.level)}: {why}"]
     pattern = f".{decimals_of(effect.factor * one.sigma)}f"
     value, sigma = (
         f"{number(effect.factor * size, form)} {effect.unit.partition(' of ')[0]}".replace(" °", "°")
@@ -227,7 +228,7 @@ def _effect(one: Signature) -> list[Cell]:
     if one.level == "significant":
         verdict = Judged(f"significant: {effect.look}", good=False)
     times = number(abs(one.value) / one.sigma, ".1f")
-    return [effect.name, effect.key, value, sigma, times, _cm(one.edge_m), verdict]
+    return [effect.name, parameter, value, sigma, times, _cm(one.edge_m), verdict]
 
 
 def _specifications(now: Judgement) -> list[Block]:

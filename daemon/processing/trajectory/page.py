@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 import numpy as np
 
-from swath.calib.labels import decimals_of, share
+from swath.calib.labels import decimals_of, number, share
 from swath.daemon.processing.pages.blocks import Block, Card, Image, Judged, Notes, Table, Words, data_uri
 from swath.daemon.processing.pages.head import NOTHING_KNOWN, PageHead
 from swath.daemon.processing.pages.render import Page, html_of
@@ -203,13 +203,9 @@ def _length(metres: float | None) -> str:
     return f"{_sigma_number(metres)} m" if metres >= 1.0 else f"{_sigma_number(100.0 * metres)} cm"
 
 
-def _number(value: float | None, pattern: str = ".3g") -> str:
-    return "–" if value is None else format(value, pattern).replace("-", "−")
-
-
 def _sigma_number(value: float | None) -> str:
     """Return a sigma with two digits."""
-    return "–" if value is None else _number(value, f".{decimals_of(value)}f")
+    return "–" if value is None else number(value, f".{decimals_of(value)}f")
 
 
 def _cards(figures: Figures) -> list[Card]:
@@ -219,7 +215,7 @@ def _cards(figures: Figures) -> list[Card]:
     flat = None if None in place else float(np.hypot(place[0], place[1]))
     return [
         (_duration(figures["duration_s"]), "flight"),
-        (f"{_number(rate)} Hz", f"{thousands(figures['epochs'])} epochs"),
+        (f"{number(rate)} Hz", f"{thousands(figures['epochs'])} epochs"),
         (_length(flat), "sigma, horizontal"),
         (_length(place[2]), "sigma, vertical"),
         (f"{_sigma_number(rms['heading_deg'])}°", "sigma of heading"),
@@ -278,8 +274,8 @@ def _observations(figures: Figures) -> Table | None:
             kind.replace("_", " "),
             thousands(row["seen"]),
             *(thousands(row[fate]) for fate in FATES),
-            _number(row["sigma_factor"], ".2f"),
-            _number(row["correlation"], ".2f"),
+            number(row["sigma_factor"], ".2f"),
+            number(row["correlation"], ".2f"),
         ]
         for kind, row in figures["observations"].items()
     ]
@@ -306,14 +302,14 @@ def _sensors(figures: Figures) -> Table | None:
     for name, axes in figures["sensors"].items():
         words, unit, factor = SENSORS[name]
         for axis, row in axes.items():
-            ratio = _number(row["largest_over_expected"], ".2f")
+            ratio = number(row["largest_over_expected"], ".2f")
             estimated = _estimated_words(factor * row["estimate"], factor * row["sigma"])
             rows.append([f"{words} {axis} ({unit})", "–", *estimated, ratio])
     arm, offset = figures["lever_arm"], figures["time_offset"]
     if arm is not None:
         for i, axis in enumerate(AXES_B):
             estimated = _estimated_words(arm["estimate_m"][i], arm["sigma_m"][i])
-            rows.append([f"lever arm {axis} (m)", _number(arm["given_m"][i], ".3f"), *estimated, "–"])
+            rows.append([f"lever arm {axis} (m)", number(arm["given_m"][i], ".3f"), *estimated, "–"])
     if offset is not None:
         estimated = _estimated_words(1e3 * offset["estimate_s"], 1e3 * offset["sigma_s"])
         rows.append(["time offset of GNSS (ms)", "–", *estimated, "–"])
@@ -324,7 +320,7 @@ def _sensors(figures: Figures) -> Table | None:
 def _estimated_words(value: float, sigma: float) -> tuple[str, str]:
     """Return an estimate and its sigma, which has two digits."""
     pattern = f".{decimals_of(sigma)}f"
-    return _number(value, pattern), _number(sigma, pattern)
+    return number(value, pattern), number(sigma, pattern)
 
 
 def _fix_words(name: str) -> str:
@@ -340,17 +336,17 @@ def _run(figures: Figures) -> Table:
         ["longest run of them", _duration(bridged["longest_s"])],
         ["time in outages", _duration(positions["outages_s"])],
         *([f"positions, {_fix_words(name)}", thousands(n)] for name, n in positions["fix_types"].items()),
-        ["satellites, median", _number(positions["satellites_median"])],
-        *([f"filter − smoother / sigma, {name}", _number(value, ".2f")] for name, value in separation.items()),
+        ["satellites, median", number(positions["satellites_median"])],
+        *([f"filter − smoother / sigma, {name}", number(value, ".2f")] for name, value in separation.items()),
         *(
-            [f"noise found, {_fix_words(name)}", f"× {_number(value, '.2f')}"]
+            [f"noise found, {_fix_words(name)}", f"× {number(value, '.2f')}"]
             for name, value in figures["noise_found"].items()
         ),
-        ["share of positions' variance that lasts", _number(figures["lasting_share"], ".2f")],
-        ["share of velocities' variance that lasts", _number(figures["lasting_velocity_share"], ".2f")],
-        ["how long velocities' errors last, s", _number(figures["lasting_velocity_s"], ".1f")],
-        ["share of headings' variance that lasts", _number(figures["lasting_heading_share"], ".2f")],
-        ["how long headings' errors last, s", _number(figures["lasting_heading_s"], ".1f")],
+        ["share of positions' variance that lasts", number(figures["lasting_share"], ".2f")],
+        ["share of velocities' variance that lasts", number(figures["lasting_velocity_share"], ".2f")],
+        ["how long velocities' errors last, s", number(figures["lasting_velocity_s"], ".1f")],
+        ["share of headings' variance that lasts", number(figures["lasting_heading_share"], ".2f")],
+        ["how long headings' errors last, s", number(figures["lasting_heading_s"], ".1f")],
         *([name.replace("_", " "), thousands(count)] for name, count in figures["counts"].items() if name not in shown),
     ]
     return Table("The run", ("", ""), [row for row in rows if row[1] != "–"])

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 from scipy import stats
 
-from swath.calib.labels import decimals_of, number, p_words, thousands, words_of
+from swath.calib.labels import decimals_of, number, p_words, thousands, worded, words_of
 from swath.calib.validation.history import History
 from swath.calib.validation.methods import (
     ALPHA,
@@ -219,7 +219,7 @@ def _size(one: Detectable) -> str:
     unit = {"deg": "°", "us": "µs", "us2": "µs²"}.get(ending, ending)
     if not one.seen:
         return "none would be detected"
-    size = one.size / parameter.factor
+    size = float(f"{one.size / parameter.factor:.2g}")
     return f"{number(size, f'.{decimals_of(size)}f')}{'' if unit == '°' else ' '}{unit}"
 
 
@@ -234,7 +234,8 @@ def _histories(histories: Iterable[History], picture: bytes | None) -> list[Bloc
         ]
         heads = ("calibration", "flown", "ω, °", "φ, °", "κ, °")
         title = f"Calibrations of {one.scanner}" + (f", {one.installation}" if one.installation else "")
-        blocks += [Table(title, heads, rows, " ".join(f"{line[0].upper()}{line[1:]}." for line in one.sentences))]
+        under = " ".join(f"{line[0].upper()}{line[1:]}." for line in one.sentences)
+        blocks += [Table(title, heads, rows, worded(under))]
     return [*blocks, *([Image("Boresight over time", data_uri(picture, "image/png"))] if picture else [])]
 
 

@@ -19,6 +19,8 @@ from swath.daemon.processing.pages.render import Page, html_of
 from swath.georef.verdicts import Level, Verdict
 
 HTML = ".html"
+TITLE = "Planned lines and planes"
+WORDS = "Dots: planes, coloured by the number of swaths that see them. Lines and their swaths have the same colour."
 HOW = (
     "The lines are flown on paper over the terrain. The returns that would lie on roofs, bare ground and around "
     "control points go through the equations of swath calibrate, with the errors that the trajectory is expected to "
@@ -53,12 +55,11 @@ def planned_page(planned: PlannedCalibration) -> str:
         if row["why"]
     ]
     heads = ("parameter", "why", "what to fly")
-    title = "Planned lines, and planes by the number of swaths that see them"
     blocks: list[Block] = [
         *([Notes(planned.notes)] if planned.notes else []),
         _parameters(planned),
         *([Table("Not determined", heads, missing, left=(0, 1, 2), stacked=True)] if missing else []),
-        Image(title, data_uri(map_png(planned), "image/png")),
+        Image(TITLE, data_uri(map_png(planned), "image/png"), title=TITLE, words=WORDS),
     ]
     crs = tables.flight.crs
     head = PageHead(crs=crs_words({"name": CRS.from_user_input(crs).name, "crs": crs}))

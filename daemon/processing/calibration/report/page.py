@@ -92,7 +92,7 @@ def _block(content: Content, form: Format, narrow: Format | None) -> Block:
 def contents_of(report: ReportInput, verdict: Verdict) -> list[Content]:
     """Return all that stands below the cards."""
     several = len(report.adjusted.calibrations) > 1
-    told = report.settings.get("trajectory errors", "").split("; ")  # stand with the settings
+    told = report.settings.get("trajectory errors", "")  # stands with the settings
     every = (*report.notes, *report.adjusted.notes)
     notes = [plain(line, several=several) for line in every if line not in told]
     found: list[Content | None] = [

@@ -141,7 +141,7 @@ def strips_picture(report: ReportInput) -> Picture | None:
 
 
 def control_picture(report: ReportInput) -> Picture | None:
-    """Return the misclosures of control points; None if there are none."""
+    """Return how far the laser lies above control points; None if there are none."""
     points = report.adjusted.control[:MOST_CONTROL]
     if not points:
         return None
@@ -149,7 +149,7 @@ def control_picture(report: ReportInput) -> Picture | None:
     def draw(canvas: Canvas) -> None:
         axes = canvas.panel(0.6, 0.3, canvas.form.width_in - 0.7, 1.7)
         at = np.arange(len(points))
-        value_cm = np.array([100.0 * point.misclosure_m for point in points])
+        value_cm = np.array([-100.0 * point.misclosure_m for point in points])
         sigma_cm = np.array([100.0 * point.sigma_m for point in points])
         bad = np.array([abs(point.normalised) > SUSPECT for point in points])
         for mine, colour in ((~bad, AFTER), (bad, BAD)):
@@ -160,7 +160,7 @@ def control_picture(report: ReportInput) -> Picture | None:
         names = [point.name for point in points]
         axes.set_xticks(at, names, fontsize=7.5, rotation=90 if steep else 0)
         axes.set_xlim(-0.6, len(points) - 0.4)
-        axes.set_ylabel("Surveyed − laser (cm)", fontsize=8.5, color=MUTED)
+        axes.set_ylabel("Laser above control (cm)", fontsize=8.5, color=MUTED)
         axes.margins(y=0.15)
 
     room = 0.07 * max(len(point.name) for point in points)
@@ -168,7 +168,7 @@ def control_picture(report: ReportInput) -> Picture | None:
     def height_in(form: Format) -> float:
         return 2.35 + (room if form.narrow or len(points) > 16 else 0.0)
 
-    return Picture("Control", "Surveyed − laser height, positive upwards, with one sigma.", height_in, draw)
+    return Picture("Control", "Height of the laser above the surveyed points, with one sigma.", height_in, draw)
 
 
 def trajectory_pictures(report: ReportInput) -> list[Picture]:

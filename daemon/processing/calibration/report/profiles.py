@@ -61,10 +61,14 @@ def comparison_table(checked: Check) -> Table | None:
 
 def _compared(one: Comparison, *, several: bool) -> list[str]:
     named = unknown(f"{one.scanner}.{one.parameter}")
-    digits = decimals_of(one.adjusted_sigma * named.factor if one.adjusted_sigma > 0.0 else one.told_sigma)
-    pattern = f".{digits}f"
-    told, told_sigma, adjusted, sigma = (
-        number(named.factor * value, pattern) for value in (one.told, one.told_sigma, one.adjusted, one.adjusted_sigma)
+    results = ((one.told, one.told_sigma), (one.adjusted, one.adjusted_sigma or one.told_sigma))
+    patterns = [f".{decimals_of(sigma * named.factor)}f" for _, sigma in results]
+    told, adjusted = (
+        number(named.factor * value, pattern) for (value, _), pattern in zip(results, patterns, strict=True)
+    )
+    told_sigma, sigma = (
+        number(named.factor * value, pattern)
+        for value, pattern in zip((one.told_sigma, one.adjusted_sigma), patterns, strict=True)
     )
     words = f"{one.scanner}: {named.words}" if several else named.words
     apart = number(one.normalised, "+.1f") + (" !" if abs(one.normalised) > DOUBTFUL else "")

@@ -32,6 +32,7 @@ from swath.georef.scanner.calibration import INDEX, PARAMETERS
 MOST_ROWS = 25
 INSIGNIFICANT = 2.0
 SAME_RAD = 1e-6  # a pre-alignment by less has changed nothing
+UNITLESS = ("priors", "trajectory")  # their observations are of several units
 OBSERVED = {"range_m": "one range", "ties": "one coordinate of a tie point", "control": "one control point"}
 
 
@@ -231,9 +232,9 @@ def groups_table(report: ReportInput) -> Table:
         [
             group.group,
             thousands(group.observations),
-            thousands(group.redundancy, 1),
+            thousands(group.redundancy, 0 if group.redundancy >= 100.0 else 1),
             number(group.variance_factor, ".3f"),
-            length(group.rms_m),
+            "–" if group.group in UNITLESS else length(group.rms_m),
             f"{thousands(group.rejected)} ({share(group.rejected / max(group.observations, 1))})",
         ]
         for group in report.adjusted.groups
@@ -295,7 +296,7 @@ def refused_table(report: ReportInput) -> Table | None:
 
 
 def control_table(report: ReportInput) -> Table | None:
-    """Return a table of misclosures and of the effect of leaving a point out; None without control."""
+    """Return a table of the laser above each point, and of the effect of leaving it out; None without control."""
     if not report.adjusted.control:
         return None
     several = len(report.adjusted.calibrations) > 1
@@ -307,19 +308,19 @@ def control_table(report: ReportInput) -> Table | None:
             one = unknown(name)
             effect = f"{words_of(one.scanner, one.name, several=several)}: {number(moved, '+.2f')} sigmas"
         fit = (
-            number(100.0 * point.misclosure_m, "+.1f"),
+            number(-100.0 * point.misclosure_m, "+.1f"),
             number(100.0 * point.sigma_m, ".1f"),
-            number(point.normalised, "+.2f"),
+            number(-point.normalised, "+.2f"),
         )
         rows.append([point.name, *fit, effect])
-    values = np.array([point.misclosure_m for point in report.adjusted.control])
+    values = np.array([-point.misclosure_m for point in report.adjusted.control])
     rms, mean = (length(float(x)) for x in (np.sqrt(np.mean(values**2)), values.mean()))
     under = f"{len(values)} points: RMS {rms}, mean {mean}. "
     under += (
         "The adjustment used every point; the rightmost column shows the parameter that changes most when the point "
         "is left out."
     )
-    heads = ("point", "misclosure, cm", "sigma, cm", "w", "changes most if left out")
+    heads = ("point", "laser above it, cm", "sigma, cm", "w", "changes most if left out")
     return Table("", heads, rows, under, left=(0, 4))
 
 

@@ -91,7 +91,7 @@ class Tables(HTMLParser):
 
 
 def faults_of(text: str) -> list[str]:
-    """Return what no page may have: empty heads, columns without content, hyphens as minus signs."""
+    """Return what no page may have: empty heads, columns without content, hyphens as minus signs, negative zeros."""
     page, faults = Tables(text), []
     for table, headed in zip(page.tables, page.headed, strict=True):
         if headed:
@@ -103,5 +103,6 @@ def faults_of(text: str) -> list[str]:
                 for number, (head, column) in enumerate(zip(heads, columns, strict=True))
                 if number and {cell.strip() for cell in column} <= {"", "–"}
             ]
+    faults += [f"zero with a sign: {word}" for word in page.words if re.fullmatch(r"\s*[−-]0(\.0+)?\s*", word)]
     words = " ".join(page.words)
     return faults + [f"hyphen: {found[0]}" for found in re.finditer(r".{0,20}(?<![\w=.,/-])-\d.{0,10}", words)]

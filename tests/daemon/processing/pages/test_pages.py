@@ -11,8 +11,9 @@ import pytest
 from pypdf import PdfReader
 
 from swath import __version__
+from swath.calib.labels import worded
 from swath.daemon.processing.pages import pdf
-from swath.daemon.processing.pages.blocks import Cell, Image, Judged, Table, Words, reasons_of
+from swath.daemon.processing.pages.blocks import Cell, Image, Judged, Notes, Table, Words, reasons_of
 from swath.daemon.processing.pages.head import (
     PageHead,
     calibration_words,
@@ -21,8 +22,8 @@ from swath.daemon.processing.pages.head import (
     head_of_sidecars,
 )
 from swath.daemon.processing.pages.names import OF_COMMAND, PRINTED
-from swath.daemon.processing.pages.pdf import BEFORE_UNIT, PdfUnavailableError, page_files, pdf_of
-from swath.daemon.processing.pages.render import Page, html_of
+from swath.daemon.processing.pages.pdf import PdfUnavailableError, page_files, pdf_of
+from swath.daemon.processing.pages.render import BEFORE_UNIT, Page, html_of
 from swath.daemon.processing.quicklook.product_facts import rows_of
 from swath.georef.verdicts import Level, Reason, Verdict
 from tests.daemon.processing.pages.builders import faults_of
@@ -54,11 +55,33 @@ def test_reasons_that_the_verdict_tells_are_not_repeated() -> None:
     assert table.rows == [["few fixes", ""], ["the arm is wrong", "measure it"]]
 
 
+def test_a_page_names_parameters_by_words() -> None:
+    reasons = (Reason(Level.CARE, "a", "add −273 ± 61 µs to time_offset_us", "calibrate"),)
+    (table,) = reasons_of(Verdict(Level.CARE, "Usable with care.", reasons))
+    assert isinstance(table, Table)
+    assert table.rows == [["add −273 ± 61 µs to time offset", "calibrate"]]
+    assert worded("scan_angle_scale_ppm, scan_angle_offset_deg") == "scan angle scale, scan angle offset"
+
+
+@pytest.mark.parametrize(("count", "wide", "printed"), [(4, 7, 5), (6, 7, 3), (7, 7, 4), (8, 4, 4), (9, 5, 5)])
+def test_rows_of_cards_have_equal_lengths(count: int, wide: int, printed: int) -> None:
+    text = html_of(Page("Kind", "one", PageHead(), [], cards=[("1", "metre")] * count))
+    assert f'style="--columns: {wide}; --printed: {printed}"' in text
+
+
+def test_a_nominal_calibration_is_never_called_good() -> None:
+    assert calibration_words("left", {"id": "c", "method": "nominal"}, "good") == "c of left, nominal, never estimated"
+    assert calibration_words("left", {"id": "c"}, "good") == "c of left, good"
+
+
 def test_times_of_a_short_flight_have_seconds() -> None:
     assert flown_words([(NINE_NS, NINE_NS + 55_000_000_000)]) == "2026-06-15, 09:00:00 to 09:00:55 UTC"
 
 
-def test_on_paper_a_unit_stays_with_its_number() -> None:
+def test_a_unit_stays_with_its_number() -> None:
+    assert "<li>shifted by 4\u00a0σ, −3\u00a0cm</li>" in html_of(
+        Page("Kind", "one", PageHead(), [Notes(["shifted by 4 σ, -3 cm"])])
+    )
     assert BEFORE_UNIT.sub("_", "12 knots, 5 s apart; 4.5 cm (15.3 σ), 3 strips, 20 % of 2 m²") == (
         "12 knots, 5_s apart; 4.5_cm (15.3_σ), 3 strips, 20_% of 2_m²"
     )
