@@ -126,6 +126,9 @@ POINTS_2 = {
 }
 
 
+USUAL_PULSES = 96  # of a packet of SDK 2, which states their number
+
+
 @dataclass(frozen=True)
 class LivoxHead:
     """A family of models.
@@ -142,6 +145,13 @@ class LivoxHead:
     sdk: int
     lines: int
     pulses_hz: int
+
+    @property
+    def bytes_per_s(self) -> float:
+        """The most that the head sends: the packets that take the most bytes for a pulse, and its IMU's at 200 Hz."""
+        kinds, header = (POINTS_1, HEADER_1) if self.sdk == 1 else (POINTS_2, HEADER_2)
+        of_pulse = max(header.itemsize / (kind.pulses or USUAL_PULSES) + kind.dtype.itemsize for kind in kinds.values())
+        return self.pulses_hz * of_pulse + 200 * (header.itemsize + IMU_DTYPE.itemsize)
 
 
 MID40 = LivoxHead("Mid-40, Mid-70", 1, 1, 100_000)

@@ -385,6 +385,7 @@ def _driver(protocol: str, head: LivoxHead) -> Driver:
         aimed=True,
         wavelength_nm=905.0,
         eight_bit_intensity=True,
+        bytes_per_s=head.bytes_per_s,
     )
 
 

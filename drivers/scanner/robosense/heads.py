@@ -84,6 +84,12 @@ class RobosenseHead:
     strongest_mode: int = 1
     last_mode: int = 2
 
+    @property
+    def bytes_per_s(self) -> float:
+        """The most that the head sends: data packets in dual return."""
+        rounds = BLOCKS * PLACES // (2 * self.lasers)
+        return 1e9 * PACKET_BYTES / (rounds * self.round_ns)
+
     def beams(self, elevation_deg: FloatArray, azimuth_deg: FloatArray) -> BeamTable:
         """Return the table of beams (lasers,); each starts ahead of the axis at the head's azimuth, not at its own."""
         azimuth = np.radians(azimuth_deg)

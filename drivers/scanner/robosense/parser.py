@@ -415,6 +415,7 @@ def _driver(protocol: str, head: RobosenseHead) -> Driver:
         needs=("installation",),
         wavelength_nm=905.0,
         eight_bit_intensity=True,
+        bytes_per_s=head.bytes_per_s,
         sent_file=SentFile(
             "DIFOP packet", _finder(head), lambda: encode_difop(head, np.linspace(-15, 15, head.lasers))
         ),

@@ -34,6 +34,7 @@ from swath.drivers.scanner.srep.layout import (
     PulseRows,
     SrepHeader,
     body_words,
+    datagram_bytes,
     encode_datagram,
     header_checks,
     nanoseconds,
@@ -363,5 +364,6 @@ DRIVERS = (
         make_time_parser=_clock_parser,
         needs=("mirror_factor",),
         line_scanner=True,
+        bytes_per_s=2e6 / 512 * datagram_bytes(512, 1),  # no data sheet: as said in docs/devices/srep.md
     ),
 )

@@ -320,6 +320,16 @@ def test_the_rate_of_the_devices_is_that_of_their_drivers(tmp_path: Path) -> Non
     none = rate("")
     vlp16 = rate(f'{head}protocol = "velodyne-vlp16"\n') - none
     assert vlp16 == pytest.approx(2 * 754 * 1206 + 0.5e6, rel=1e-3), "dual return: 1508 packets a second, and positions"
+    for protocol, mb_per_s in (
+        ("robosense-helios32", 1_152_000 / 384 * 1248e-6),  # points a second in dual return, and those of a packet
+        ("robosense-rs16", 576_000 / 384 * 1248e-6),
+        ("livox-avia", 240_000 / 30 * 1278e-6),  # three returns, 30 pulses a packet
+        ("livox-mid360", 200_000 / 96 * 1380e-6),
+        ("srep", 32.2),
+    ):
+        more = "mirror_factor = 2\n" if protocol == "srep" else ""
+        found = rate(f'{head}protocol = "{protocol}"\n{more}') - none - 0.5e6
+        assert found == pytest.approx(1e6 * mb_per_s, rel=0.01), protocol
     assert rate(receiver) - none == 11_520
     assert highest_bytes_per_s(None) == 25.2e6
 
