@@ -48,8 +48,9 @@ from swath.drivers.scanner.livox.layout import AVIA, POINTS_1, PTP, encode_packe
 from swath.drivers.scanner.livox.parser import LivoxParser
 from swath.drivers.scanner.ouster.layout import LidarLayout
 from swath.drivers.scanner.ouster.parser import OusterParser
-from swath.drivers.scanner.robosense.heads import RS32
-from swath.drivers.scanner.robosense.parser import RobosenseParser
+from swath.drivers.scanner.robosense.heads import MODE_DUAL as MODE_DUAL_RS
+from swath.drivers.scanner.robosense.heads import MSOP_DTYPE, RS16, RS32
+from swath.drivers.scanner.robosense.parser import RobosenseParser, encode_difop
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.drivers.scanner.srep.parser import SrepParser
 from swath.drivers.scanner.velodyne.heads import PACKET_BYTES, VLP16, VLP32C, VLS128
@@ -269,13 +270,20 @@ def hesai_figure(name: str, head: HesaiHead, units: ByteRows, repeats: int) -> F
 
 
 def measure_robosense(repeats: int) -> Iterator[Figure]:
-    """Measure RS-LiDAR-32 with made packets in single return, 60 % of the places used."""
+    """Measure RoboSense heads with made packets, 60 % of the places used: 32 lasers, and 16 in dual return."""
     packets = [unit.data for unit in read_pcap(FIXTURES / "robosense" / "made.pcap.gz", port=2368)][24:39]
     units = np.tile(np.frombuffer(b"".join(packets), dtype=np.uint8).reshape(len(packets), -1), (240, 1))
-    file = (FIXTURES / "robosense" / "rs32.difop").read_bytes()
-    settings = DeviceSettings("scanner/bench", {}, {"geometry": file})
-    make = partial(RobosenseParser, head=RS32)
-    yield head_figure("RS-LiDAR-32, single return", make, settings, units, 10e6, repeats)
+    pairs = units.copy()
+    blocks = pairs.view(MSOP_DTYPE)[:, 0]["blocks"]
+    blocks["azimuth"] = np.repeat(blocks["azimuth"][:, ::2], 2, axis=1)
+    for name, head, sent, mode in (
+        ("RS-LiDAR-32, single return", RS32, units, 1),
+        ("RS-LiDAR-32, dual return", RS32, pairs, MODE_DUAL_RS),
+        ("RS-LiDAR-16, dual return", RS16, units, MODE_DUAL_RS),
+    ):
+        file = encode_difop(head, np.linspace(-15, 15, head.lasers), mode=mode)
+        settings = DeviceSettings("scanner/bench", {}, {"geometry": file})
+        yield head_figure(name, partial(RobosenseParser, head=head), settings, sent, 10e6, repeats)
 
 
 def velodyne_units(name: str, step_us: float) -> ByteRows:
