@@ -187,8 +187,10 @@ class ImuConfig(Section):
         None,
         description="sbg-ellipse, sbg-ecom: the Sync In that PPS is wired to; its event holds the latched counter",
     )
-    altitude: Literal["geoid", "ellipsoid"] = Field(
-        "geoid", description="oxts-ncom: what the unit's altitude counts from, by its own configuration"
+    altitude: Literal["geoid", "ellipsoid"] | None = Field(
+        None,
+        description="oxts-ncom, nmea2000: what the device's altitude counts from, by its own configuration; absent: "
+        "geoid for oxts-ncom, fixes without a height for nmea2000",
     )
     solution_of: Literal["vehicle", "sensor1", "sensor2"] = Field(
         "vehicle", description="applanix-pos: the point whose navigation is the solution"

@@ -5,7 +5,9 @@ values of a field mean that it is not available. Layouts: canboat, docs/canboat.
 devices send the same PGN: one source is used for each, `source_address` or else the first that sends it.
 
 Rates and angles come at 10 to 20 Hz and without a device time: they become status records, not inertial samples.
-Positions of 129025 and 129026 have no time and become status too; 129029, which has a time, becomes a `GnssFix`.
+Positions of 129025 and 129026 have no time and become status too, as do the DOPs of 129539; 129029, which has a time,
+becomes a `GnssFix`. Its altitude is "referenced to WGS-84" (canboat, also gpsd), but receivers on the recorded bus send
+heights above the sea in it: the setting ``altitude`` says which it is, and without it fixes have no height.
 
 Fast packets: messages of up to 223 bytes in up to 32 frames of one identifier. The first data byte of each frame is
 ``sequence << 5 | frame``: the sequence number (0 … 7) identifies the message by source and PGN, so that messages of
@@ -53,6 +55,7 @@ DAY_UNITS = 864_010_000  # a day with a leap second, in 1e-4 s
 UNIX_EPOCH = dt.date(1970, 1, 1)
 SATELLITE_TIME_SOURCES = (0, 1)  # in 126992: GPS, GLONASS; the others are radio and local clocks
 TRUE_NORTH, MAGNETIC_NORTH = 0, 1
+ALTITUDES = ("ellipsoid", "geoid")  # what the altitude of 129029 may count from
 
 
 class Field(NamedTuple):
@@ -100,6 +103,7 @@ SINGLE_FRAMES = {
     129026: Layout(
         6, (Field("course_rad", 2, "<u2", 1e-4), Field("speed_mps", 4, "<u2", 0.01)), (Bits("reference", 1, 2),)
     ),
+    129539: Layout(8, (Field("hdop", 2, "<i2", 0.01), Field("vdop", 4, "<i2", 0.01), Field("tdop", 6, "<i2", 0.01))),
 }
 # 129029: SID, date (days), time (1e-4 s), latitude, longitude (1e-16 deg), altitude (1e-6 m), type and method,
 # integrity, satellites, HDOP, PDOP (0.01), geoidal separation (0.01 m), number of reference stations; stations follow
@@ -130,12 +134,18 @@ class Nmea2000Parser(PacketParser):
             time_only: return time messages only, for the recorder.
 
         Raises:
-            DriverSettingsError: source_address is not the address of a device.
+            DriverSettingsError: source_address is not the address of a device, or altitude no reference.
         """
         super().__init__()
         wanted = settings.config.get("source_address")
         if wanted is not None and (type(wanted) is not int or not 0 <= wanted <= LARGEST_SOURCE):
             raise DriverSettingsError(f"source_address: got {wanted!r}, want 0 to {LARGEST_SOURCE}")
+        altitude = settings.config.get("altitude")
+        if altitude not in (None, *ALTITUDES):
+            raise DriverSettingsError(f"altitude: got {altitude!r}, want {' or '.join(ALTITUDES)}")
+        self._altitude: str | None = altitude
+        self._source = settings.source
+        self._without_height: tuple[float, float | None] | None = None  # first altitude that no setting explains
         self._wanted: int | None = wanted
         self._used: dict[int, int] = {}  # PGN -> the source used
         self._packets = FastPackets()
@@ -164,6 +174,18 @@ class Nmea2000Parser(PacketParser):
         self._packets.close()
         self._take_packet_counts()
         return []
+
+    def remarks(self) -> list[str]:
+        """Return a line where fixes lack a height because no setting says what their altitude counts from."""
+        if self._without_height is None:
+            return []
+        altitude_m, separation_m = self._without_height
+        geoid = "no geoidal separation" if separation_m is None else f"geoidal separation {separation_m:.1f} m"
+        return [
+            f"{self._source}: fixes have no height, because receivers disagree about what their altitude counts from "
+            f"(here {altitude_m:.1f} m, {geoid}); in the [imu.…] table of the bus set "
+            'altitude = "ellipsoid", as the standard says, or "geoid", if it is above the sea'
+        ]
 
     # -- frames
 
@@ -297,18 +319,33 @@ class Nmea2000Parser(PacketParser):
             self.counters.count_bad("bad_value")
             return records
         fix_type = METHODS.get(method, FixType.NONE) if has_position else FixType.NONE
+        height_m, undulation_m = self._height(values) if has_position else (None, None)
         fix = GnssFix(
             host_time_ns=host_time_ns,
             time=tag,
             lat_rad=radians(lat_deg) if has_position else None,
             lon_rad=radians(lon_deg) if has_position else None,
-            height_m=None,  # senders disagree about the reference of their altitude
+            height_m=height_m,
             fix_type=fix_type,
             satellites=satellites if is_available(satellites, 8) else None,
             valid=fix_type is not FixType.NONE,
             message=str(GNSS_POSITION),
+            undulation_m=undulation_m,
         )
         return [*records, fix]
+
+    def _height(self, values: Values) -> tuple[float | None, float | None]:
+        """Return ellipsoidal height and undulation of a position; no height where its altitude cannot be placed."""
+        altitude_m, separation_m = values.get("altitude_m"), values.get("geoidal_separation_m")
+        if altitude_m is None or self._altitude == "ellipsoid":
+            return altitude_m, separation_m if altitude_m is not None else None
+        if self._altitude is None:
+            self._without_height = self._without_height or (altitude_m, separation_m)
+            return None, None
+        if separation_m is None:
+            self.counters.errors["separation_not_available"] += 1
+            return None, None
+        return altitude_m + separation_m, separation_m
 
 
 def pgn_and_source(can_id: NDArray[np.uint32]) -> tuple[Int64Array, Int64Array]:

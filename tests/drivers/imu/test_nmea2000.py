@@ -44,9 +44,9 @@ def decoded(name: str) -> list[dict[str, Any]]:
         return [json.loads(line) for line in file]
 
 
-def parser_of(source_address: int | None = None) -> Nmea2000Parser:
+def parser_of(source_address: int | None = None, altitude: str | None = None) -> Nmea2000Parser:
     """Return a parser that listens to one device, or to the first of each PGN."""
-    return Nmea2000Parser(DeviceSettings("imu/main", {"source_address": source_address}))
+    return Nmea2000Parser(DeviceSettings("imu/main", {"source_address": source_address, "altitude": altitude}))
 
 
 def parse(units: list[bytes] | tuple[bytes, ...], parser: Nmea2000Parser) -> list[Record]:
@@ -70,11 +70,18 @@ def fast_frames(message: bytes, sequence: int, source: int = 1) -> list[bytes]:
     ]
 
 
-def position(lat_deg: float, *, method: int = 1, days: int = 19326, time: int = 432_890_000) -> bytes:
+def position(
+    lat_deg: float,
+    *,
+    method: int = 1,
+    days: int = 19326,
+    time: int = 432_890_000,
+    altitude: int = 43_000_000,
+    separation: int = 4690,
+) -> bytes:
     """Return the 43 bytes of 129029 without stations."""
-    lat, lon, altitude = round(lat_deg * 1e16), round(8.5 * 1e16), 43_000_000
-    counts = struct.pack("<BHIqqq", 5, days, time, lat, lon, altitude)
-    return counts + struct.pack("<BBBhhiB", method << 4, 0xFC, 9, 90, 0x7FFF, 4690, 0)
+    counts = struct.pack("<BHIqqq", 5, days, time, round(lat_deg * 1e16), round(8.5 * 1e16), altitude)
+    return counts + struct.pack("<BBBhhiB", method << 4, 0xFC, 9, 90, 0x7FFF, separation, 0)
 
 
 @pytest.mark.parametrize("name", NMEA2000_COUNTS)
@@ -92,10 +99,16 @@ def test_every_frame_of_the_bus_is_read() -> None:
 def test_values_of_every_source_are_decoded_in_order() -> None:
     units = nmea2000_bus("can0-2_candump.log.gz")
     theirs = decoded("can0-2.nmea2000_decoded.jsonl.gz")
+    dops = decoded("can0-2.129539_decoded.jsonl.gz")
     compared = 0
-    for source in sorted({message["src"] for message in theirs}):
+    for source in sorted({message["src"] for message in [*theirs, *dops]}):
         records = [r for r in parse(units, parser_of(source)) if isinstance(r, DeviceStatus | TimeMessage)]
-        mine = [r for r in records if r.message != "129029"]
+        mine = [r for r in records if r.message == "129539"]
+        for record, message in zip(mine, [one for one in dops if one["src"] == source], strict=True):
+            assert isinstance(record, DeviceStatus)
+            said = {key: value for key in ("hdop", "vdop", "tdop") if (value := message["fields"][key]) is not None}
+            assert record.values == pytest.approx(said)
+        mine = [r for r in records if r.message not in ("129029", "129539")]
         expected = [message for message in theirs if message["src"] == source]
         assert len(mine) == len(expected)
         for record, message in zip(mine, expected, strict=True):
@@ -139,6 +152,41 @@ def test_fast_packets_of_every_source_are_decoded_in_order() -> None:
             assert (values["hdop"], values["pdop"]) == pytest.approx((fields["hdop"], fields["pdop"]))
 
 
+@pytest.mark.parametrize(
+    ("altitude", "heights"), [("ellipsoid", (43.0, 2.7)), ("geoid", (89.9, 49.6)), (None, (None, None))]
+)
+def test_a_setting_says_what_the_altitude_counts_from(altitude: str | None, heights: tuple[float | None, ...]) -> None:
+    """Sources 20 and 0 of the bus send 43.0 m and 2.7 m at one place on the water: ellipsoid and sea."""
+    units = nmea2000_bus("can0-2_candump.log.gz")[:3000]
+    for source, height in zip((20, 0), heights, strict=True):
+        parser = parser_of(source, altitude)
+        fix = next(record for record in parse(units, parser) if isinstance(record, GnssFix))
+        assert fix.height_m == (None if height is None else pytest.approx(height, abs=1e-6))
+        assert fix.undulation_m == (None if height is None else pytest.approx(46.9))
+        assert len(parser.remarks()) == (altitude is None)
+    units = tuple(fast_frames(position(47.0), 0))
+    parser = parser_of()
+    parse(units, parser)
+    (line,) = parser.remarks()
+    assert "(here 43.0 m, geoidal separation 46.9 m); in the [imu.…] table of the bus set altitude = " in line
+
+
+def test_an_altitude_that_is_not_available_gives_no_height() -> None:
+    unknown = 0x7FFF_FFFF_FFFF_FFFF
+    for altitude, message, height, errors in (
+        ("ellipsoid", position(47.0, separation=0x7FFF_FFFF), 43.0, {}),
+        ("geoid", position(47.0, separation=0x7FFF_FFFF), None, {"separation_not_available": 1}),
+        ("geoid", position(47.0, altitude=unknown), None, {}),
+        ("ellipsoid", position(47.0, altitude=unknown), None, {}),
+        (None, position(47.0, altitude=unknown), None, {}),
+    ):
+        parser = parser_of(altitude=altitude)
+        (fix,) = [record for record in parse(fast_frames(message, 0), parser) if isinstance(record, GnssFix)]
+        assert (fix.height_m, fix.valid, parser.counters.errors, parser.remarks()) == (height, True, errors, [])
+    with pytest.raises(DriverSettingsError, match="altitude: got 'sea', want ellipsoid or geoid"):
+        parser_of(altitude="sea")
+
+
 def test_the_first_source_of_each_pgn_is_used_and_the_others_counted() -> None:
     units, theirs = nmea2000_bus("can0-2_candump.log.gz"), decoded("can0-2.nmea2000_decoded.jsonl.gz")
     first: dict[int, int] = {}
@@ -152,6 +200,7 @@ def test_the_first_source_of_each_pgn_is_used_and_the_others_counted() -> None:
     expected = [m["fields"]["rate"] for m in theirs if m["pgn"] == 127251 and m["src"] == first[127251]]
     assert rates == pytest.approx(expected, rel=1e-12)
     used = sum(first[message["pgn"]] == message["src"] for message in theirs)
+    used += sum(r_message(record) == "129539" for record in records) - 356
     fixes = sum(isinstance(record, GnssFix) for record in records)
     assert parser.counters.errors["other_source"] == len(theirs) - used + 356 - fixes
     assert 59 <= fixes <= 60
