@@ -168,6 +168,8 @@ def _print(report: ImportReport, captures: list[Capture]) -> None:
         print(one_line(f"{capture.path}: {capture.kind}, {', '.join(parts)}"))
         for head in capture.heads.values():
             print(one_line(f"  {head.words()}"))
+        for line in capture.mixed():
+            print(one_line(f"warning: {line}"))
     for path in report.paths:
         print(path)
 

@@ -138,10 +138,15 @@ def _print_session(console: Console, numbers: dict[str, Any]) -> None:
 
 def _print_trouble(console: Console, numbers: dict[str, Any]) -> None:
     """Print the error counts that wires and controllers report themselves, and what degrades the streams."""
+    from swath.daemon.log.wires import mixed_text
+
     for source, values in numbers["sources"].items():
         if values.get("degraded"):
             faults = _plain(", ".join(values["degraded"]))
             console.print(f"[red]{_plain(source)}: DEGRADED: {faults}[/]", highlight=False)
+        if values.get("mixed_senders") and not source.startswith("raw/"):
+            text = mixed_text(values["mixed_senders"], recorded=True)
+            console.print(f"[red]{_plain(source)}: {_plain(text)}[/]", highlight=False)
         if values["trouble"]:
             counts = ", ".join(f"{count:,} {key.replace('_', ' ')}" for key, count in values["trouble"].items())
             senders = f"; refused senders: {values['refused_senders']}" if values.get("refused_senders") else ""

@@ -26,6 +26,7 @@ from swath.daemon.devices.identify import Heard, describe_time, not_understood
 from swath.daemon.devices.values import Values
 from swath.daemon.log.directory import nearest_there
 from swath.daemon.log.host_clock import ClockDiscipline, read_clock_discipline
+from swath.daemon.log.wires import Senders, mixed_text
 from swath.drivers.driver import RAW, find_driver
 from swath.drivers.parser import PacketParser
 from swath.drivers.session import Session
@@ -34,7 +35,8 @@ from swath.drivers.transports.can.bitrate import interface_bitrate
 from swath.drivers.transports.opening import open_pps, open_transport
 from swath.drivers.transports.spec import TransportSpec, parse_pps
 from swath.georef.records import ChunkBatch, Record, TimeMessage
-from swath.georef.timescales import ahead_s, distance_text
+from swath.georef.timescales import SECOND_NS, ahead_s, distance_text
+from swath.georef.timescales.stamp_scale import ABSOLUTE_FROM_NS, NEVER_SET_S, date_text
 
 SLICE_S = 0.1
 KEPT_BYTES = 1 << 20  # of each wire, to identify a device that does not use the configured protocol
@@ -151,9 +153,12 @@ class Reading:
             self.report.time = describe_time(self.entry, self.heard)
             self.report.problems += _answer_problems(self)
             self.report.facts, self.report.doubts = self.values.judge(self.entry.kind, self.entry.settings.config)
+            never_set = stamp_doubts(self.entry, self.heard)
+            self.report.doubts += never_set
             if isinstance(self.parser, PacketParser):
                 self.report.notes += self.parser.warnings
-            self.report.notes += lock_notes(self.entry, self.heard) + far_notes(self.heard, read_clock_discipline())
+            self.report.notes += [] if never_set else lock_notes(self.entry, self.heard)
+            self.report.notes += far_notes(self.heard, read_clock_discipline())
 
     def _take(self, records: list[Record]) -> None:
         self.heard.add(records)
@@ -168,6 +173,7 @@ class Wire:
         self._spec = spec
         self._readings = readings
         self._main = main
+        self._senders = Senders()
 
     def listen(self, span: Span) -> None:
         """Feed the readings until the time is up; then report the faults of the wire."""
@@ -175,6 +181,9 @@ class Wire:
         for blocks in span.listen(session):
             for block in blocks:
                 batch = _batch(self.report.source, block)
+                if block.peer is not None:
+                    times_ns = batch.host_time_ns
+                    self._senders.add(block.peer[0], int(times_ns[0]), int(times_ns[-1]), len(times_ns))
                 for reading in self._readings:
                     reading.feed(batch, main=self._main)
                 if not self._main:
@@ -187,6 +196,8 @@ class Wire:
         for report in [reading.report for reading in self._readings] if self._main else [self.report]:
             report.opens = session.openings > 0
             report.problems += _wire_problems(session, counters, report, seconds)
+            if self._senders.mixed and report.protocol != RAW:
+                report.problems.append(mixed_text(self._senders.counts, recorded=False))
             if self._spec.kind == "can" and self._spec.interface == "socketcan":
                 report.problems += bitrate_problems(self._spec, interface_bitrate(self._spec.channel))
             if counters.refused:
@@ -348,6 +359,30 @@ def _answer_problems(reading: Reading) -> list[str]:
     if bad > DAMAGED_SHARE * good:
         found.append(f"{bad} of {bad + good} messages damaged")
     return found + _time_problems(entry, heard)
+
+
+def stamp_doubts(entry: DeviceEntry, heard: Heard) -> list[str]:
+    """Report a scanner that stamps neither past the hour nor by a pulse, and whose clock nobody has set.
+
+    Its stamps then show a date days from this computer's, or count from its own start.
+    """
+    clock = str(entry.settings.config.get("clock"))
+    if entry.kind != "scanner" or heard.stamp is None or heard.sees_pps is not None or clock == "free":
+        return []
+    driver = find_driver(entry.kind, entry.protocol)
+    if driver.past_hour or driver.line_scanner:
+        return []
+    host_ns, device_ns = heard.stamp
+    if device_ns < ABSOLUTE_FROM_NS:
+        shows = f"counts from its own start ({device_ns / SECOND_NS:,.0f} s ago)"
+    elif abs(device_ns - host_ns) >= NEVER_SET_S * SECOND_NS:
+        shows = f"shows {date_text(device_ns)}, this computer's {date_text(host_ns)}"
+    else:
+        return []
+    return [
+        f"its clock {shows}: neither PTP nor a receiver has set it; without time its returns make no points: wait "
+        "until the head's web page shows a lock, or connect PTP or a receiver to it"
+    ]
 
 
 def lock_notes(entry: DeviceEntry, heard: Heard) -> list[str]:

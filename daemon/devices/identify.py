@@ -28,6 +28,7 @@ class Heard:
         sees_pps: latest report of the device that it has latched a PPS or is locked to it; None if it does not report
             this.
         imu_clock: host and device time of the first and of the last inertial sample since the counter last went back.
+        stamp: host and device time of the latest sample of a scanner's clock, ns since 1970 and as the head counts.
     """
 
     counts: Counter[str] = field(default_factory=Counter)
@@ -35,6 +36,7 @@ class Heard:
     valid_time: TimeMessage | None = None
     sees_pps: bool | None = None
     imu_clock: tuple[tuple[int, int], tuple[int, int]] | None = None
+    stamp: tuple[int, int] | None = None
 
     def add(self, records: list[Record]) -> None:
         """Count records and keep the state of the device's time."""
@@ -77,6 +79,8 @@ class Heard:
 
     def _add_clock(self, record: DeviceClockSamples) -> None:
         rows = record.rows
+        if len(rows):
+            self.stamp = int(rows["host_time_ns"][-1]), int(rows["device_time_ns"][-1])
         latched, locked = rows["pps_time_ns"] >= 0, rows["locked"]
         says = latched | (locked >= 0) | (rows["pps_count"] >= 0)
         if np.any(says):
@@ -110,11 +114,14 @@ def describe_tag(tag: TimeTag) -> str:
 def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | None:
     """Return the protocol of the same kind that decodes most of the bytes, if the configured one decodes no records.
 
+    Scanner heads whose packets do not differ are named together, as ``robosense-helios16p or robosense-helios32``.
+
     A parser that decodes records is preferred to one that only finds messages (receivers mix protocols on a port, and
     their parsers frame each other's messages); the latter must find more than ``than``, the count of the configured
     protocol. A driver that needs settings which only the right configuration has is tried by its probe, or left out.
     """
-    best, most = None, (0, max(than, LEAST_MESSAGES - 1))
+    best: list[str] = []
+    most = (0, max(than, LEAST_MESSAGES - 1))
     for protocol, driver in all_drivers(entry.kind).items():
         if protocol == entry.protocol:
             continue
@@ -128,8 +135,10 @@ def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | Non
         heard.add(parser.close())
         found = (heard.counts.total(), parser.counters.messages.total())
         if found > most:
-            best, most = protocol, found
-    return best
+            best, most = [protocol], found
+        elif found == most and best and entry.kind == "scanner":
+            best.append(protocol)
+    return " or ".join(best) or None
 
 
 def not_understood(

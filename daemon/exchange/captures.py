@@ -11,6 +11,7 @@ from typing import Any
 
 from swath.daemon.exchange.routes import Port, Routes
 from swath.daemon.exchange.sidecar import complete, cut_by_sidecar, sidecar_of
+from swath.daemon.log.wires import Senders, mixed_text
 from swath.drivers.captures.base import (
     LATEST_NS,
     Address,
@@ -54,7 +55,9 @@ class Capture:
         time: timing of the bytes of a serial file without times.
         heads: of an lvx file, by code. head_ports: the ports of those that are used, by code. start_ns: of an lvx file
             whose packages have no UTC, the time at which it begins.
-        units: number used, by source. passed: number that belong to no device, by port or interface.
+        units: number used, by source.
+        senders: of its datagrams, by source.
+        passed: number that belong to no device, by port or interface.
     """
 
     path: Path
@@ -69,6 +72,7 @@ class Capture:
     tally: CaptureTally = field(default_factory=CaptureTally)
     units: Counter[str] = field(default_factory=Counter)
     passed: Counter[str] = field(default_factory=Counter)
+    senders: dict[str, Senders] = field(default_factory=dict)
 
     def read(self, routes: Routes) -> Iterator[ImportUnit]:
         """Yield the units that belong to a device, in the file's order; damage of the file is noted in ``tally``."""
@@ -81,6 +85,8 @@ class Capture:
                 continue
             peer = unit.source if unit.source != NOBODY else None
             self.units[port.source] += 1
+            if peer is not None:
+                self.senders.setdefault(port.source, Senders()).add(peer[0], unit.time_ns, unit.time_ns, 1)
             yield ImportUnit(unit.time_ns, port, unit.data, peer)
 
     def _captured(self) -> Iterator[CapturedUnit]:
@@ -117,6 +123,14 @@ class Capture:
             self.passed[f"port {destination}" if unit.destination is not None else destination] += 1
         return found
 
+    def mixed(self) -> list[str]:
+        """Return a line for each source to which several devices send."""
+        return [
+            f"{self.path}: {source}: {mixed_text(senders.counts, recorded=False)}"
+            for source, senders in sorted(self.senders.items())
+            if senders.mixed and not source.startswith("raw/")
+        ]
+
     def plain(self) -> dict[str, Any]:
         """Return the counts as plain values for ``--json``."""
         return {
@@ -125,6 +139,7 @@ class Capture:
             "units": dict(self.units),
             "of_no_device": dict(self.passed),
             "heads": [_plain_head(head) for head in self.heads.values()],
+            "mixed_senders": {name: dict(one.counts) for name, one in self.senders.items() if one.mixed},
             "passed_over": {what: count for what, count in self.tally.passed.items() if count},
             "damage": self.tally.damage,
             "first_damage": self.tally.first_damage or None,

@@ -13,6 +13,7 @@ from swath.daemon.log.format import LogError, source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch, json_objects
 from swath.daemon.log.parsers import stored_config, stored_parsers
 from swath.daemon.log.reader import Session
+from swath.daemon.log.wires import Senders
 from swath.daemon.log.words import stream_faults
 from swath.drivers.parser import PacketParser, Parser
 from swath.georef.arrays import Int64Array
@@ -78,6 +79,7 @@ class SourceNumbers:
     parser: Parser | None = None
     second_port: bool = False
     records: Counter[str] = field(default_factory=Counter)
+    senders: Senders = field(default_factory=Senders)
 
     def add(self, times_ns: Int64Array, units: Any) -> None:
         """Count units that were read."""
@@ -98,6 +100,12 @@ class SourceNumbers:
         if "time_state" in status:
             _count_word(self.time_states, status["time_state"])
 
+    def add_sender(self, batch: LogBatch) -> None:
+        """Count the datagrams of a batch by their sender, if the log names it."""
+        if address := batch.channel.metadata.get("source_address"):
+            first_ns, last_ns = int(batch.log_time_ns.min()), int(batch.log_time_ns.max())
+            self.senders.add(str(address), first_ns, last_ns, len(batch.log_time_ns))
+
     def plain(self, *, complete: bool) -> dict[str, Any]:
         """Return plain values for ``--json``; in a complete log every status must agree with the units read
         before it.
@@ -114,6 +122,7 @@ class SourceNumbers:
             "gaps": self.intervals.gaps(),
             "lost": {key: _count(status, key) for key in _ACCOUNT[2:]},
             "trouble": {key: count for key in _TROUBLE if (count := _count(status, key))},
+            "mixed_senders": dict(self.senders.counts) if self.senders.mixed else {},
             "refused_senders": str(status.get("refused_senders", ""))[:MAX_SENDERS_TEXT],
             "account_errors": self.account_errors + (self.miscounted if complete else 0),
             "state": status.get("state"),
@@ -262,6 +271,7 @@ def _take(batch: LogBatch, sources: dict[str, SourceNumbers], events: EventNumbe
     if source is not None:
         numbers = sources.setdefault(source, SourceNumbers())
         numbers.add(batch.log_time_ns, batch.units)
+        numbers.add_sender(batch)
         parser = parsers.get(source.removesuffix("/aux"))
         if parser is not None:
             numbers.parser = parser

@@ -10,12 +10,16 @@ from swath.drivers.parser import Parser
 BAD_CHECKSUM = "bad_checksum"
 SEQUENCE_GAP = "sequence_gap"
 FOREIGN = ("bad_length", "bad_magic")  # from another sender on this port
+OTHER_HEADS = ("wrong_product", "wrong_serial", "other_head")
 WITHOUT_RETURNS = ("bad_gps", "bad_nmea", "bad_position", "bad_sample")
 WHY = {
     BAD_CHECKSUM: "a wrong checksum",
     "bad_version": "a version of the protocol that this program does not read",
     "bad_length": "a length that the protocol does not have",
     "bad_magic": "no sign of the protocol",
+    "wrong_product": "they are of another model than that of the configured protocol",
+    "wrong_serial": "they are of another head than that of geometry.file",
+    "other_head": "they are of another head on the same hub",
 }
 
 
@@ -44,7 +48,11 @@ def refused_by(parser: Parser) -> Counter[str]:
     """Return how many messages a parser has refused so far, by reason."""
     counters = parser.counters
     found = Counter(
-        {code: count for code, count in counters.errors.items() if code.startswith("bad_") or code == SEQUENCE_GAP}
+        {
+            code: count
+            for code, count in counters.errors.items()
+            if code.startswith("bad_") or code in (SEQUENCE_GAP, *OTHER_HEADS)
+        }
     )
     found[BAD_CHECKSUM] = counters.bad_checksums
     return +found
@@ -69,5 +77,5 @@ def undecoded_lines(log: str, undecoded: Mapping[str, Mapping[str, int]]) -> tup
                 continue
             why = WHY.get(reason, reason.replace("_", " "))
             line = f"{log}: {count:,} messages of scanner/{scanner} were not read: {why}"
-            (warnings if reason in (*FOREIGN, *WITHOUT_RETURNS) else holes).append(line)
+            (warnings if reason in (*FOREIGN, *OTHER_HEADS, *WITHOUT_RETURNS) else holes).append(line)
     return holes, warnings

@@ -23,7 +23,7 @@ from swath.daemon.log.events import Events, Severity
 from swath.daemon.log.format import ChannelSpec
 from swath.daemon.log.host_clock import HostClock, StampConverter, read_clock_pair
 from swath.daemon.log.mcap.encode import MESSAGE_HEADER_BYTES, EncodedBlock, encode_block
-from swath.daemon.log.wires import BLOCK_BYTES, MAX_SENDERS, SILENT_AFTER_S, Wire
+from swath.daemon.log.wires import BLOCK_BYTES, MAX_SENDERS, SILENT_AFTER_S, Senders, Wire, mixed_text
 from swath.daemon.system import name_thread
 from swath.drivers.session import Session, SessionState
 from swath.drivers.transports.base import RawEdge, TransportCounters, UnitBlock
@@ -292,6 +292,7 @@ class UnitReceiver(Receiver):
         self._units_seen = units_seen
         self._channel_ids: dict[tuple[str, int] | None, int] = {}
         self._sequences: dict[int, int] = {}
+        self._senders = Senders()
         self._reported_buffer = False
         self._trouble = WireTrouble(wire.source, shared.events)
 
@@ -352,6 +353,11 @@ class UnitReceiver(Receiver):
     def _hand_over(self, block: UnitBlock, log_time_ns: Int64Array) -> None:
         count, length = block.units.shape
         channel_id = self._channel(block.peer)
+        if block.peer is not None and not self._senders.mixed:
+            self._senders.add(block.peer[0], int(log_time_ns[0]), int(log_time_ns[-1]), count)
+            if self._senders.mixed and not self._wire.source.startswith("raw/"):
+                text = mixed_text(self._senders.counts, recorded=False)
+                self.shared.events.post(Severity.ERROR, self.source, "mixed_senders", text)
         step = max(1, BLOCK_BYTES // (length + MESSAGE_HEADER_BYTES))
         for first in range(0, count, step):
             units, times = block.units[first : first + step], log_time_ns[first : first + step]

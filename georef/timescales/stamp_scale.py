@@ -9,6 +9,7 @@ head's.
 
 from __future__ import annotations
 
+import datetime as dt
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -29,6 +30,9 @@ LOCKED_SIGMA_NS = 20_000.0  # makers state 10 µs to 50 µs for a head locked to
 # over the log, of the head's stamps against GPS time: a greater drift means a free-running head
 GREATEST_DRIFT_NS = 2_000_000.0
 SIGMAS = 3.0
+DATED_FROM_S = 60  # from GPS time: differences from this size on are shown by both dates
+NEVER_SET_S = 2 * 86_400  # a wrong time zone or date of a PTP master is smaller; a head that nobody set is years away
+UNIX_EPOCH = dt.datetime(1970, 1, 1)  # noqa: DTZ001  the scale of the stamps is what is to be found
 
 
 class StampScale(StrEnum):
@@ -46,7 +50,8 @@ class Stamps:
     """The origin of a head's stamps, found or configured.
 
     offset_ns: GPS time less stamp, of absolute stamps. sigma_ns: of one stamp. text: the reason, with figures. brief:
-    they cover less than a second, before the head itself reports its origin.
+    they cover less than a second, before the head itself reports its origin. never_set: they show a date days from GPS
+    time, so that neither PTP nor a receiver has set the head's clock.
     """
 
     scale: StampScale
@@ -54,6 +59,7 @@ class Stamps:
     offset_ns: int = 0
     sigma_ns: float = LOCKED_SIGMA_NS
     brief: bool = False
+    never_set: bool = False
 
 
 def judge(
@@ -138,22 +144,38 @@ def _absolute(at: Int64Array, quickest: Int64Array, slack_ns: float, leap_second
     scale = names.get(whole_s)
     named = scale.value.removeprefix("ptp-").upper() if scale is not None else f"GPS {whole_s:+d} s"
     told = f"they count from 1970 in {named}, {least_ms:.1f} to {most_ms:.1f} ms before their arrival, {why}"
+    within = (beside >= -GREATEST_LATENCY_NS - slack_ns) & (beside <= AHEAD_NS + slack_ns)
+    usual = "stamps set by PTP lie 0 to 100 ms before their arrival"
     if wanted in (StampScale.TAI, StampScale.UTC):
         other = "" if scale is wanted else "; the whole seconds come from their arrival"
+        other += "" if within.all() else f"; {usual}, so these may be up to a second off"
         return Stamps(wanted, f"as configured; {told}{other}", offset_ns, sigma_ns)
-    within = (beside >= -GREATEST_LATENCY_NS - slack_ns) & (beside <= AHEAD_NS + slack_ns)
-    if int(np.ptp(beside)) > SECOND_NS // 2:
-        return Stamps(StampScale.FREE, f"{told}: their time scale changes during the log")
-    if scale is None:
-        return Stamps(StampScale.FREE, f"{told}: neither TAI nor UTC; if PTP set them, configure it (clock)")
-    if not within.all():
-        return Stamps(
-            StampScale.FREE,
-            f"{told}: stamps set by PTP lie 0 to 100 ms before their arrival; if PTP set these, configure it (clock)",
-        )
-    if drift_ns > GREATEST_DRIFT_NS:
-        return Stamps(StampScale.FREE, f"{told}: they drift like those of a head that has lost PTP")
+    dates = _dates(int(at[0]), whole_s)
+    if abs(whole_s) >= NEVER_SET_S:
+        return Stamps(StampScale.FREE, f"{dates}: neither PTP nor a receiver has set its clock", never_set=True)
+    if abs(whole_s) >= DATED_FROM_S:
+        told = f"{dates}, {least_ms:.1f} to {most_ms:.1f} ms before their arrival, {why}"
+    doubts = (
+        (int(np.ptp(beside)) > SECOND_NS // 2, "their time scale changes during the log"),
+        (scale is None, "neither TAI nor UTC; if PTP set them, configure it (clock)"),
+        (not within.all(), f"{usual}; if PTP set these, configure it (clock)"),
+        (drift_ns > GREATEST_DRIFT_NS, "they drift like those of a head that has lost PTP"),
+    )
+    doubt = next((text for holds, text in doubts if holds), "")
+    if doubt or scale is None:
+        return Stamps(StampScale.FREE, f"{told}: {doubt}")
     return Stamps(scale, told, offset_ns, sigma_ns)
+
+
+def _dates(gps_ns: int, ahead_s: int) -> str:
+    """Return the date that stamps show at a GPS time (ns), and that time, for a difference of whole seconds."""
+    there_ns = GPS_EPOCH_UNIX_S * SECOND_NS + gps_ns
+    return f"they show {date_text(there_ns + ahead_s * SECOND_NS)} at GPS time {date_text(there_ns)}"
+
+
+def date_text(since_1970_ns: int) -> str:
+    """Return date and time of nanoseconds since 1970, in the time scale that they are given in."""
+    return f"{UNIX_EPOCH + dt.timedelta(seconds=since_1970_ns // SECOND_NS):%Y-%m-%d %H:%M:%S}"
 
 
 def _drift(at: Int64Array, quickest: Int64Array, slack_ns: float) -> tuple[float, str]:

@@ -53,10 +53,12 @@ def pty(send: Callable[[int], bytes] | None = None) -> Iterator[str]:
 
 
 @contextmanager
-def udp_sender(port: int, send: Callable[[int], bytes]) -> Iterator[None]:
-    """Send datagrams repeatedly to a port of this computer."""
-    with socket(AF_INET, SOCK_DGRAM) as sender, repeating(lambda n: _send(sender, port, send(n)), 0.01):
-        yield
+def udp_sender(port: int, send: Callable[[int], bytes], own: str = "127.0.0.1") -> Iterator[None]:
+    """Send datagrams repeatedly to a port of this computer, from its address ``own``."""
+    with socket(AF_INET, SOCK_DGRAM) as sender:
+        sender.bind((own, 0))
+        with repeating(lambda n: _send(sender, port, send(n)), 0.01):
+            yield
 
 
 def _send(sender: socket, port: int, data: bytes) -> None:

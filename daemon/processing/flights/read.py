@@ -13,9 +13,11 @@ import numpy as np
 from pyproj import CRS
 
 from swath.daemon.errors import ConfigError, ExitCode, UserError
-from swath.daemon.log.chunk_index import Listening, LogIndex, index_log
+from swath.daemon.log.chunk_index import SCANNER, Listening, LogIndex, index_log, read_chunks
+from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.parsers import stored_config
 from swath.daemon.log.reader import Session, open_logs
+from swath.daemon.log.wires import Senders, mixed_text
 from swath.daemon.processing.carried_verdict import (
     Carried,
     calibration_verdicts,
@@ -264,6 +266,9 @@ def _read(session: Session, setup: Setup, tell: Tell, *, positions: bool) -> Fli
     first, last = index.spans()
     if not len(first):
         raise UserError(f"{log}: the log has no scanner data")
+    if mixed := mixed_scanners(index):
+        lines = [f"{log}: {source}: {mixed_text(counts, recorded=True)}" for source, counts in sorted(mixed.items())]
+        raise UserError("\n".join(lines))
     clocks.clocks = find_stamps(index, setup.sources, clocks.clocks.host)
     clocks.remarks += clocks.clocks.remarks
     flight = Flight(session, setup, clocks, index, (0, 0), (int(first.min()), int(last.max()) + 1))
@@ -274,6 +279,28 @@ def _read(session: Session, setup: Setup, tell: Tell, *, positions: bool) -> Fli
     begin, end = flight.gps_from_host(flight.host_span).tolist()
     flight.span = (begin, end)
     return flight
+
+
+def mixed_scanners(index: LogIndex) -> dict[str, Mapping[str, int]]:
+    """Return the scanners of a log to whose port several devices sent at the same time, with datagrams by address.
+
+    Only a log whose channels name several senders is read, up to the first place where they alternate.
+    """
+    addresses: dict[str, set[str]] = {}
+    for part in index.parts:
+        for spec in part.channels.values():
+            if spec.topic.startswith(SCANNER) and (address := spec.metadata.get("source_address")):
+                addresses.setdefault(spec.topic, set()).add(address)
+    doubtful = {topic for topic, found in addresses.items() if len(found) > 1}
+    senders = {topic: Senders() for topic in doubtful}
+    for chunk in index.scanner_chunks() if doubtful else ():
+        for batch in read_chunks(index, [chunk], doubtful.__contains__, []):
+            first_ns, last_ns = int(batch.log_time_ns.min()), int(batch.log_time_ns.max())
+            address = batch.channel.metadata.get("source_address", "")
+            senders[batch.channel.topic].add(address, first_ns, last_ns, len(batch.log_time_ns))
+        if all(one.mixed for one in senders.values()):
+            break
+    return {source_of_topic(topic) or topic: one.counts for topic, one in senders.items() if one.mixed}
 
 
 def _choose(request: GeorefOptions, flight: Flight, tell: Tell) -> None:

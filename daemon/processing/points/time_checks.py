@@ -120,6 +120,11 @@ def time_trouble(
             "because its clock was set; do not set it during a recording"
         )
     found = "" if stamps is None or stamps.scale is not StampScale.FREE else f" ({stamps.text})"
+    if stamps is not None and stamps.never_set:
+        return (
+            f"{lost_text}: its stamps run free{found}; before recording, wait until the head's web page shows that GPS "
+            "or PTP is locked"
+        )
     return (
         f"{lost_text}: its stamps run free{found}; lock the head to the PPS, let it latch the PPS, or set "
         f"scanner.{scanner}.clock if its stamps are UTC or TAI nevertheless"

@@ -25,6 +25,9 @@ from swath.daemon.devices.identify import describe_tag, identify
 from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.captures.opening import read_pcap
 from swath.drivers.parser import DeviceSettings
+from swath.drivers.scanner.hesai.models import XT32
+from swath.drivers.scanner.robosense.heads import HELIOS32
+from swath.drivers.scanner.robosense.parser import encode_msop
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
 from swath.drivers.scanner.velodyne.position import PPS_ABSENT, PPS_LOCKED, encode_position_packet
 from swath.drivers.transports.spec import parse_transport
@@ -32,6 +35,7 @@ from swath.georef.records import ChunkBatch, TimeScale, TimeTag
 from tests.daemon.builders import nmea_sentence
 from tests.daemon.rig import HANGS_S, free_udp_port
 from tests.daemon.wires import pty, repeating, udp_sender
+from tests.drivers.scanner.hesai.builders import packet
 from tests.drivers.vnb import read_messages
 
 ROOT = Path(__file__).parents[3]
@@ -169,6 +173,31 @@ class TestWorkingDevices:
         assert "no position packet (Velodyne port 8308" in note
         assert "set auxiliary" in note
         assert 'clock = "utc-hour"' in configured
+
+    def test_a_head_whose_clock_nobody_set_is_doubtful(self, tmp_path: Path) -> None:
+        """Without GPS or PTP the heads of several makers show a date of 2017 (HesaiLidar_General_ROS #16)."""
+        data = free_udp_port()
+        text = (
+            f'[scanner.roof]\ntransport = "udp:127.0.0.1:{data}?buffer_mb=1"\nprotocol = "hesai-xt32"\n'
+            "installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
+        )
+        time = dt.datetime(2017, 3, 2, 1, 0, 0, tzinfo=dt.UTC)
+        with udp_sender(data, lambda n: packet(XT32, time=time + dt.timedelta(milliseconds=n), sequence=n + 1)):
+            report = check(text, tmp_path, 0.5)["scanner/roof"]
+        (doubt,) = [line for line in report.doubts if "clock" in line]
+        assert doubt.startswith("its clock shows 2017-03-02 01:00:0")
+        assert "neither PTP nor a receiver has set it" in doubt
+        assert report.notes == []
+
+    def test_two_heads_on_one_port_are_a_problem(self, tmp_path: Path) -> None:
+        """Two heads as delivered send to the same port of the same computer (ros-drivers/velodyne #346)."""
+        data = free_udp_port()
+        with udp_sender(data, srep_datagram, "127.0.0.2"), udp_sender(data, srep_datagram, "127.0.0.3"):
+            mixed = check(srep(data), tmp_path, 0.3)["scanner/left"]
+            told_apart = check(srep(data).replace("?", "?source=127.0.0.3&"), tmp_path, 0.3)["scanner/left"]
+        (problem,) = mixed.problems
+        assert problem.startswith("2 devices send to its port at the same time and are read as one: 127.0.0.")
+        assert told_apart.problems == []
 
     def test_a_head_is_read_by_the_metadata_beside_the_configuration(self, tmp_path: Path) -> None:
         """The head is an OS0 with its own IMU, on two ports."""
@@ -333,6 +362,16 @@ class TestOtherProtocols:
         spec = parse_transport("serial:/dev/ttyUSB0")
         entry = DeviceEntry("imu", "main", spec, None, "nmea2000", None, DeviceSettings("imu/main"), {})
         assert identify(entry, kept, than=0) == protocol
+
+    def test_heads_whose_packets_are_alike_are_named_together(self) -> None:
+        """A packet of a Helios does not show whether it has 16 or 32 lasers."""
+        time = dt.datetime(2026, 11, 21, tzinfo=dt.UTC)
+        unit = encode_msop(time, np.arange(12) * 20, np.full((12, 32), 1000), 7, HELIOS32)
+        rows = np.frombuffer(unit * 20, np.uint8).reshape(20, -1)
+        kept = [ChunkBatch("scanner/left", np.arange(20, dtype=np.int64) * 1_000_000, rows)]
+        spec = parse_transport("udp:0.0.0.0:6699")
+        entry = DeviceEntry("scanner", "left", spec, None, "robosense-rs16", None, DeviceSettings("scanner/left"), {})
+        assert identify(entry, kept, than=0) == "robosense-helios16p or robosense-helios32"
 
     @pytest.mark.parametrize(
         ("recording", "answers_as"),

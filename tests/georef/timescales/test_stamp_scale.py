@@ -84,6 +84,31 @@ def test_absolute_timestamps_of_unknown_scale_run_free_until_configured() -> Non
     assert np.array_equal(stamps + said.offset_ns, gps)
 
 
+def test_a_clock_that_nobody_set_is_named_with_its_date() -> None:
+    """Pandar64 and Helios heads without GPS or PTP start in 2017 (HesaiLidar_General_ROS #16, rslidar_sdk #210)."""
+    gps = truth_ns()
+    shown = absolute(gps, 0) - gps[0] + 1_488_416_400 * NS  # 2017-03-02 01:00:00
+    shown -= UNIX_MINUS_GPS_S * NS
+    found = judged(shown + 628_000_000, gps)
+    assert (found.scale, found.never_set) == (StampScale.FREE, True)
+    assert found.text.startswith("they show 2017-03-02 01:00:0")
+    assert found.text.endswith(": neither PTP nor a receiver has set its clock")
+
+
+def test_a_date_a_day_off_is_shown_and_can_be_configured() -> None:
+    """An Ouster head may add a day to the date of NMEA (ouster-sdk #154); the fraction is right."""
+    gps = truth_ns()
+    found = judged(absolute(gps, 86_400 - LEAP), gps)
+    assert (found.scale, found.never_set) == (StampScale.FREE, False)
+    assert "configure it (clock)" in found.text
+
+
+def test_configured_stamps_without_a_plausible_fraction_are_doubted() -> None:
+    gps = truth_ns()
+    found = judged(absolute(gps, 19) - 600_000_000, gps, wanted=StampScale.TAI)
+    assert found.text.endswith("so these may be up to a second off")
+
+
 def test_a_counter_since_power_on_runs_free() -> None:
     gps = truth_ns()
     assert judged(gps - gps[0] + 77 * NS, gps).scale is StampScale.FREE
