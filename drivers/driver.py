@@ -18,7 +18,7 @@ from swath.georef.records import ByteRows, EventMark, GnssFix, GnssHeading, Name
 if TYPE_CHECKING:
     from swath.drivers.startup import StartupMessage, StartupOptions
 
-TransportKind = Literal["serial", "can", "udp", "tcp", "gnss", "imu", "raw", "ntrip"]
+TransportKind = Literal["serial", "can", "udp", "tcp", "gnss", "imu", "scanner", "raw", "ntrip"]
 
 STREAM_TRANSPORTS: tuple[TransportKind, ...] = ("serial", "udp", "tcp")  # every wire that carries a byte stream
 
@@ -144,8 +144,9 @@ class Driver:
     Attributes:
         protocol: its name in the configuration.
         kind: gnss, imu, scanner or corrections.
-        transports: kinds of transport that can carry it; `STREAM_TRANSPORTS` for the byte stream of a port; ``gnss`` or
-            ``imu`` for a device inside the stream of a receiver or of an inertial unit of the same protocol.
+        transports: kinds of transport that can carry it; `STREAM_TRANSPORTS` for the byte stream of a port; ``gnss``,
+            ``imu`` or ``scanner`` for a device inside the stream of a receiver, inertial unit or scanner of the same
+            protocol.
         yields: record types that its parser returns.
         summary: one line for ``swath devices``.
         make_parser: builds the parser of all record types.

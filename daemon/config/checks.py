@@ -196,7 +196,12 @@ def _check_transport(config: Config, section: str, table: DeviceTable, driver: D
     except ValueError as error:
         yield f"{section}.{error}"
     else:
-        tables: dict[str, Mapping[str, DeviceTable]] = {"gnss": config.gnss, "imu": config.imu, "raw": config.raw}
+        tables: dict[str, Mapping[str, DeviceTable]] = {
+            "gnss": config.gnss,
+            "imu": config.imu,
+            "scanner": config.scanner,
+            "raw": config.raw,
+        }
         carriers = tables.get(spec.kind, {})
         got = f'{section}.transport: got "{table.transport}"'
         if spec.carrier is not None and spec.address not in carriers:
@@ -221,7 +226,7 @@ def _check_transport(config: Config, section: str, table: DeviceTable, driver: D
 def _check_carrier(section: str, table: DeviceTable, spec: TransportSpec, carrier: DeviceTable) -> Iterator[str]:
     """Check the device whose stream holds another one's bytes: it has a wire of its own, and speaks the protocol."""
     name = f"{spec.kind}.{spec.address}"
-    if carrier.transport.partition(":")[0] in ("gnss", "imu"):
+    if carrier.transport.partition(":")[0] in ("gnss", "imu", "scanner"):
         yield f'{section}.transport: got "{table.transport}", but [{name}] has no wire of its own; name one that has'
     elif carrier.protocol != table.protocol:
         wanted = f'"{carrier.protocol}" like [{name}], whose stream carries it'

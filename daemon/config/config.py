@@ -220,7 +220,12 @@ class Config:
         device does not exist.
         """
         kind, _, name = table.transport.partition(":")
-        carriers: dict[str, Mapping[str, DeviceTable]] = {"gnss": self.gnss, "imu": self.imu, "raw": self.raw}
+        carriers: dict[str, Mapping[str, DeviceTable]] = {
+            "gnss": self.gnss,
+            "imu": self.imu,
+            "scanner": self.scanner,
+            "raw": self.raw,
+        }
         tables = carriers.get(kind, {})
         return (name, tables[name]) if name in tables else None
 

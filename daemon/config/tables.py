@@ -162,7 +162,8 @@ class ImuConfig(Section):
     """``[imu.<name>]``: an inertial measurement unit."""
 
     transport: Text = Field(
-        description="can:<interface>:<channel>?…, serial:…, udp:…, tcp:…, or gnss:<name> (inside its stream)"
+        description="can:<interface>:<channel>?…, serial:…, udp:…, tcp:…, or gnss:<name>, scanner:<name> (inside "
+        "its stream)"
     )
     protocol: Text = Field(description="dbc, or a named profile (`swath devices` lists them)")
     dbc: Text | None = Field(None, description="the DBC file, relative to this file")

@@ -235,7 +235,7 @@ def _wires(reading: Reading, readings: dict[str, Reading]) -> Iterable[Wire]:
     inside = [other for other in readings.values() if other.entry.transport.carrier == entry.source]
     yield Wire(reading.report, entry.transport, [reading, *inside], main=True)
     if entry.auxiliary is not None:
-        yield Wire(Report(f"{entry.source}/aux", entry.protocol), entry.auxiliary, [reading], main=False)
+        yield Wire(Report(f"{entry.source}/aux", entry.protocol), entry.auxiliary, [reading, *inside], main=False)
 
 
 def _run(jobs: list[Callable[[], None]], span: Span) -> None:

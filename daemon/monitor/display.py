@@ -85,7 +85,7 @@ class Monitor:
             self._reserve_bytes = int(config.session.reserve_mb * 1e6)
             for kind, name, table in config.device_tables():
                 carrier, _, carrier_name = table.transport.partition(":")
-                if carrier in ("gnss", "imu"):
+                if carrier in ("gnss", "imu", "scanner"):
                     self._inside.setdefault(f"{carrier}/{carrier_name}", []).append(f"{kind}/{name}")
 
     def _take(self, batch: LogBatch) -> None:
@@ -94,7 +94,8 @@ class Monitor:
         source = source_of_topic(topic)
         if source is not None:
             self._watch(source).add_units(batch)
-            for other in [source.removesuffix("/aux")] if source.endswith("/aux") else self._inside.get(source, ()):
+            head = source.removesuffix("/aux")
+            for other in [*([head] if head != source else []), *self._inside.get(head, ())]:
                 self._watch(other).decode(batch)
         elif topic.startswith("/status/"):
             watch = self._watch(topic.removeprefix("/status/"))

@@ -6,6 +6,7 @@ tcp:<host>:<port>?silent_s=10
 can:<interface>:<channel>?<keyword>=<value>…
 gnss:<name>
 imu:<name>
+scanner:<name>
 raw:<name>
 ntrip:<host>:<port>/<mountpoint>?user=<name>&password_env=<variable>&version=2&position=47.5,8.7,500
 """
@@ -20,8 +21,9 @@ from dataclasses import dataclass, field
 PPS_FORMS = "/dev/pps0, serial-dcd:/dev/ttyS0 or fixed:<path>"
 FORMS = (
     "serial:<path>, udp:<host>:<port>, tcp:<host>:<port>, can:<interface>:<channel>, gnss:<name>, imu:<name>, "
-    "raw:<name> or ntrip:<host>:<port>/<mountpoint>"
+    "scanner:<name>, raw:<name> or ntrip:<host>:<port>/<mountpoint>"
 )
+CARRIERS = ("gnss", "imu", "scanner", "raw")  # kinds of device whose stream can hold another device
 MAX_BUFFER_MB = 1023  # the kernel stores twice the value in an int
 MAX_SILENT_S = 86_400
 MAX_BAUD = 20_000_000  # no UART is faster; the kernel's speed is an int of 32 bits
@@ -35,7 +37,7 @@ class TransportSpec:
     """One checked transport of the configuration.
 
     Attributes:
-        kind: "serial", "udp", "tcp", "can", "ntrip"; or "gnss", "imu" or "raw" (inside the stream of that device: no
+        kind: "serial", "udp", "tcp", "can", "ntrip"; or one of `CARRIERS` (inside the stream of that device: no
             transport of its own).
         address: the text between the kind and the options.
         options: keyword to value, as text.
@@ -85,7 +87,7 @@ class TransportSpec:
     @property
     def carrier(self) -> str | None:
         """Source whose stream holds the device's bytes, as ``gnss/rover``; None: the transport is a wire of its own."""
-        return f"{self.kind}/{self.address}" if self.kind in ("gnss", "imu", "raw") else None
+        return f"{self.kind}/{self.address}" if self.kind in CARRIERS else None
 
     @property
     def device(self) -> str:
@@ -362,6 +364,7 @@ _CHECKS: dict[str, Callable[[TransportSpec], None]] = {
     "can": _check_can,
     "gnss": _check_carrier,
     "imu": _check_carrier,
+    "scanner": _check_carrier,
     "raw": _check_carrier,
     "ntrip": _check_ntrip,
 }

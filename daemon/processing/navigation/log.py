@@ -145,7 +145,7 @@ class _Reader:
 
 
 def read_navigation_log(session: Session, sources: NavigationSources) -> NavigationLog:
-    """Read all messages of a session except the scanners', chunk by chunk.
+    """Read all messages of a session except the scanners', chunk by chunk; those of a scanner that holds the IMU too.
 
     Raises:
         ConfigError: a driver cannot work with its settings.
@@ -153,7 +153,7 @@ def read_navigation_log(session: Session, sources: NavigationSources) -> Navigat
     """
     listening = Listening(session)
     reader = _Reader(sources, listening)
-    for batch in listening.batches(lambda topic: not topic.startswith(SCANNER), skim=True):
+    for batch in listening.batches(lambda topic: not topic.startswith(SCANNER) or sources.holds_imu(topic), skim=True):
         reader.take(batch)
     session.growing = listening.growing
     found = reader.close()

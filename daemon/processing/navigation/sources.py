@@ -164,6 +164,11 @@ class NavigationSources:
         """Return the sources whose messages are in a wire's bytes."""
         return self._devices.inside(source)
 
+    def holds_imu(self, topic: str) -> bool:
+        """Return whether a topic is of a scanner that holds the IMU in its stream."""
+        kind, _, name = self.imu.transport.partition(":")
+        return kind == "scanner" and topic.startswith(f"/scanner/{name}/")
+
     def edge_of(self, source: str) -> str | None:
         """Return the polarity of the edges of ``pps/name``; None: there is no such source."""
         return self._devices.edge_of(source)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from swath.daemon.log.chunk_index import SCANNER
 from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.host_messages import edges_of, readings_of
 from swath.daemon.log.mcap.chunks import LogBatch
@@ -141,11 +142,16 @@ class _ClockReader:
 def read_clocks(session: Session, sources: Sources, *, positions: bool = False, motion: bool = True) -> LogClocks:
     """Read all messages of a session except the scanners', a first pass before its returns are georeferenced.
 
-    Scanners' data are skipped chunk by chunk: a chunk holds one class of channels. With ``positions`` the receivers'
-    fixes and the IMU's specific forces are kept too; without ``motion`` nothing of the IMUs is read.
+    Scanners' data are skipped chunk by chunk: a chunk holds one class of channels. Those of a scanner whose stream
+    holds an IMU are read. With ``positions`` the receivers' fixes and the IMU's specific forces are kept too; without
+    ``motion`` nothing of the IMUs is read.
     """
     reader = _ClockReader(sources, session, positions=positions, motion=motion)
-    for batch in session.batches(lambda topic: not topic.startswith("/scanner/"), skim=True):
+
+    def is_read(topic: str) -> bool:
+        return not topic.startswith(SCANNER) or (motion and sources.holds_imu(topic))
+
+    for batch in session.batches(is_read, skim=True):
         reader.take(batch)
     reader.close()
     ins = sources.ins_rows(np.concatenate(reader.ins) if reader.ins else np.empty(0, INS_DTYPE))

@@ -175,7 +175,7 @@ class LogRecords:
 
     def _batches(self, source: str, host_span: Span) -> Iterator[ChunkBatch]:
         """Yield the units of a source's wire from the chunks that reach into a span of host time."""
-        scanner = self.sources[source] == "scanner"
+        scanner = self.sources[source] == "scanner" or self._sources.is_in_scanner(source)
         start_ns, stop_ns = host_span
 
         def is_of_wire(topic: str) -> bool:

@@ -100,12 +100,23 @@ class Sources:
         return None if pps is None else pps.edge
 
     def inside(self, source: str) -> list[str]:
-        """Return sources whose messages are in a wire's bytes: its own, an IMU or INS inside a receiver's stream, a
-        receiver inside an IMU's.
+        """Return sources whose messages are in a wire's bytes: its own, an IMU or INS inside a receiver's or scanner's
+        stream, a receiver inside an IMU's. A scanner's second port (``/aux``) is part of its stream.
         """
+        source = source.removesuffix("/aux")
         transport = source.replace("/", ":", 1)
         tables = self.config.device_tables()
         return [source, *(f"{kind}/{name}" for kind, name, table in tables if table.transport == transport)]
+
+    def holds_imu(self, topic: str) -> bool:
+        """Return whether a topic is of a scanner that holds an IMU in its stream (``transport = "scanner:NAME"``)."""
+        held = [imu.transport.partition(":") for imu in self.config.imu.values()]
+        return any(kind == "scanner" and topic.startswith(f"/scanner/{name}/") for kind, _, name in held)
+
+    def is_in_scanner(self, source: str) -> bool:
+        """Return whether a source is an IMU in the stream of a scanner."""
+        imu = self.config.imu.get(source.removeprefix("imu/")) if source.startswith("imu/") else None
+        return imu is not None and imu.transport.startswith("scanner:")
 
     def parsers(self, kinds: tuple[DeviceKind, ...], *, whole: bool = False) -> dict[str, Parser]:
         """Return new parsers of these kinds of sources, by source.

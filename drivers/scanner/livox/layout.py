@@ -29,6 +29,7 @@ NO_SYNC, PTP = 0, 1  # both SDKs: nanoseconds since power-on; of the PTP master
 PPS_GPS_1, PPS_1 = 3, 4  # SDK 1: UTC of GPRMC and pulse; nanoseconds since the last pulse
 GPS_2 = 2  # SDK 2: nanoseconds of UTC since 1970, of GPRMC and pulse
 IMU_1, IMU_2 = 6, 0  # types of data
+SAMPLES_HZ = 200.0  # of the IMU, "Livox SDK Communication Protocol", IMU Data Push Frequency
 
 HEADER_1 = np.dtype(
     [
@@ -147,11 +148,16 @@ class LivoxHead:
     pulses_hz: int
 
     @property
+    def imu_bytes(self) -> int:
+        """Bytes of a packet with a sample of the IMU."""
+        return (HEADER_1 if self.sdk == 1 else HEADER_2).itemsize + IMU_DTYPE.itemsize
+
+    @property
     def bytes_per_s(self) -> float:
-        """The most that the head sends: the packets that take the most bytes for a pulse, and its IMU's at 200 Hz."""
+        """The most that the head sends: the packets that take the most bytes for a pulse, and its IMU's."""
         kinds, header = (POINTS_1, HEADER_1) if self.sdk == 1 else (POINTS_2, HEADER_2)
         of_pulse = max(header.itemsize / (kind.pulses or USUAL_PULSES) + kind.dtype.itemsize for kind in kinds.values())
-        return self.pulses_hz * of_pulse + 200 * (header.itemsize + IMU_DTYPE.itemsize)
+        return self.pulses_hz * of_pulse + SAMPLES_HZ * self.imu_bytes
 
 
 MID40 = LivoxHead("Mid-40, Mid-70", 1, 1, 100_000)

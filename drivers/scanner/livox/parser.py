@@ -86,10 +86,14 @@ class LivoxParser(PacketParser):
         settings: no key is needed.
         head: the models.
         clock_only: return no returns and no IMU samples, and clock samples of one point packet in 50 ms of host time.
+        imu_only: return IMU samples and their clock samples; point packets are counted only, without their CRC.
     """
 
-    def __init__(self, settings: DeviceSettings, head: LivoxHead, *, clock_only: bool = False) -> None:
+    def __init__(
+        self, settings: DeviceSettings, head: LivoxHead, *, clock_only: bool = False, imu_only: bool = False
+    ) -> None:
         super().__init__()
+        self._imu_only = imu_only
         self._head = head
         self._kinds: dict[int, PointType] = POINTS_1 if head.sdk == 1 else POINTS_2
         self._imu_type = IMU_1 if head.sdk == 1 else IMU_2
@@ -117,6 +121,12 @@ class LivoxParser(PacketParser):
             host_time_ns, headers, units = host_time_ns[good], headers[good], units[good]
         if not len(headers):
             return []
+        if self._imu_only:
+            others = headers["data_type"] != self._imu_type
+            self._count(headers[others], length)
+            host_time_ns, headers, units = host_time_ns[~others], headers[~others], units[~others]
+            if not len(headers):
+                return []
         time_ns, right = self._times(host_time_ns, headers)
         self.counters.count_bad("bad_time", int((~right).sum()), length)
         if not right.all():
@@ -160,7 +170,8 @@ class LivoxParser(PacketParser):
             self.counters.count_bad(code, int((good & ~found).sum()), length)
             good &= found
         if self._head.sdk == 2:
-            bad = good & ~_crc_holds(headers, units)
+            checked = good & (headers["data_type"] == self._imu_type) if self._imu_only else good
+            bad = checked & ~_crc_holds(headers, units, checked)
             self.counters.bad_checksums += int(bad.sum())
             self.counters.bytes_skipped += int(bad.sum()) * length
             return good & ~bad
@@ -314,7 +325,10 @@ class LivoxParser(PacketParser):
         rows["pps_time_ns"] = time_ns[good] // SECOND_NS * SECOND_NS if latched else -1
         rows["specific_force_b"], rows["angular_rate_b"] = force[good], rate[good]
         rows["temperature_c"], rows["gps_week"] = np.nan, -1
-        return [ImuSamples(rows)]
+        if not self._imu_only:
+            return [ImuSamples(rows)]
+        clock = _clock_rows(rows["host_time_ns"], rows["device_time_ns"], rows["device_time_ns"], latched=latched)
+        return [ImuSamples(rows), DeviceClockSamples(clock)]
 
 
 class _SincePulse:
@@ -335,10 +349,10 @@ class _SincePulse:
         return unwrapped
 
 
-def _crc_holds(headers: StructArray, units: ByteRows) -> BoolArray:
-    """Return (n,) whether the CRC of time and data is right, or not sent (0, as in a Mid-360's point packets)."""
+def _crc_holds(headers: StructArray, units: ByteRows, checked: BoolArray) -> BoolArray:
+    """Return (n,) whether the CRC of time and data is right, or not sent (0, as a Mid-360 may), or unchecked."""
     sent = headers["crc32"]
-    good: BoolArray = sent == 0
+    good: BoolArray = (sent == 0) | ~checked
     at = HEADER_2.itemsize - 8
     for place in np.flatnonzero(~good).tolist():
         good[place] = crc32(units[place, at:].data) == int(sent[place])

@@ -268,3 +268,35 @@ def test_the_time_parser_gives_clock_samples_only() -> None:
     assert {type(record) for record in records} == {DeviceClockSamples, DeviceStatus}
     assert len(clock_of(records)) < 20
     assert (HEADER_1.itemsize, HEADER_2.itemsize) == (18, 36)
+
+
+def imu_parser_of(name: str) -> PacketParser:
+    """Return the parser of the IMU inside a head."""
+    made = find_driver("imu", f"livox-{name}").make_parser(DeviceSettings("imu/head"))
+    assert isinstance(made, PacketParser)
+    return made
+
+
+@pytest.mark.parametrize("name", ["avia", "mid360"])
+def test_the_parser_of_the_imu_alone_counts_points_and_returns_samples(name: str) -> None:
+    units, whole, parser = FILES[name](), parser_of(name), imu_parser_of(name)
+    wanted = rows_of(feed(whole, units), ImuSamples)
+    records = feed(parser, units)
+    found = rows_of(records, ImuSamples)
+    for field in wanted.dtype.names or ():
+        np.testing.assert_array_equal(found[field], wanted[field])
+    assert len(wanted) > 0
+    np.testing.assert_array_equal(clock_of(records)["device_time_ns"], wanted["device_time_ns"])
+    assert {type(record) for record in records} == {ImuSamples, DeviceClockSamples}
+    assert parser.counters.messages == whole.counters.messages
+    assert parser.counters.bytes_framed == parser.counters.bytes == sum(map(len, units))
+    check_packets(lambda: imu_parser_of(name), units, seeds=(3,))
+
+
+def test_a_wrong_checksum_of_points_is_left_to_the_scanners_parser() -> None:
+    sample = encode_packet_2(0, 1, 3 * S, [((0.1, 0.2, -0.3), (0, 0, 1))], span_100ns=0)
+    point = encode_packet_2(1, 1, 3 * S, np.ones(2, dtype=POINTS_2[1].dtype))
+    broken = [unit[:24] + b"\1\2\3\4" + unit[28:] for unit in (sample, point)]
+    parser = imu_parser_of("mid360")
+    assert feed(parser, broken) == []
+    assert (parser.counters.bad_checksums, parser.counters.bytes_framed) == (1, len(point))
