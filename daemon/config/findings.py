@@ -29,7 +29,7 @@ USUAL_BAUDS = (
 def configuration_findings(config: Config) -> list[str]:
     """Return what is hardly meant in a valid configuration, one line each."""
     lines = [] if any(config.device_tables()) or config.pps else [NO_SOURCE]
-    return [*lines, *lever_arm_findings(config), *_bauds(config), *_unseen_pps(config)]
+    return [*lines, *lever_arm_findings(config), *_bauds(config), *_unseen_pps(config), *_untold_angles(config)]
 
 
 def scanner_lever_arm_b(config: Config, name: str) -> tuple[str, list[float]]:
@@ -89,6 +89,17 @@ def _unseen_pps(config: Config) -> Iterator[str]:
         way = _why_unseen(table, find_driver(kind, table.protocol).yields)
         if way:
             yield f"{kind}.{name}.pps: nothing shows that the device sees its PPS: {way}"
+
+
+def _untold_angles(config: Config) -> Iterator[str]:
+    """Yield a line for each scanner that sends its own angles, if neither a port nor a file gives them."""
+    for name, table in config.scanner.items():
+        sent = None if table.protocol == RAW else find_driver("scanner", table.protocol).sent_file
+        if sent is not None and table.auxiliary is None and (table.geometry is None or table.geometry.file is None):
+            yield (
+                f"scanner.{name}.auxiliary: is missing, the port of the {sent.what}s, which alone state the angles of "
+                "its beams; add it, or give geometry.file"
+            )
 
 
 def _why_unseen(table: ImuConfig | ScannerConfig, yields: tuple[type, ...]) -> str:

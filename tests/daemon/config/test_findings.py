@@ -64,6 +64,16 @@ def test_a_pps_that_nothing_can_show_is_named() -> None:
     assert findings(PPS + head + 'auxiliary = "udp:0.0.0.0:8308"\n') == []
 
 
+def test_angles_that_nothing_can_state_are_named() -> None:
+    head = '[scanner.l]\ntransport = "udp:0.0.0.0:6699"\ninstallation_deg = [0, 0, 0]\nprotocol = "robosense-rs32"\n'
+    (line,) = findings(head)
+    assert line.startswith(
+        "scanner.l.auxiliary: is missing, the port of the DIFOP packets, which alone state the angles"
+    )
+    assert findings(head + 'auxiliary = "udp:0.0.0.0:7788"\n') == []
+    assert findings(head + '[scanner.l.geometry]\nfile = "../robosense/rs32.difop"\n') == []
+
+
 def test_the_geometry_is_said_in_words() -> None:
     assert place_words(np.array([0.10, -0.05, -1.20])) == "0.10 m forward, 0.05 m left, 1.20 m above the IMU"
     assert place_words(np.array([-0.4, 0.2, 0.0])) == "0.40 m backward, 0.20 m right of the IMU"
