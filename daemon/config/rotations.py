@@ -11,6 +11,8 @@ import numpy as np
 from swath.georef.arrays import FloatArray
 
 ROTATION_TOLERANCE = 1e-6  # for a matrix typed with 7 digits; 0.2 arc seconds
+WHOLE_TURN_DEG = 360.0
+RIGHT_ANGLE_DEG = 90.0
 NEARLY = 0.01  # farthest element of a matrix that is taken for a rotation with too few digits
 
 
@@ -53,6 +55,31 @@ def with_matrix(table: Any, matrix: str, angles: str) -> Any:
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e9  # also no NaN
+
+
+def within_a_turn(angles_deg: list[float]) -> list[float]:
+    """Return angles in degrees unchanged.
+
+    Raises:
+        ValueError: one is more than a whole turn, a slip of the key that its remainder would hide.
+    """
+    for angle in angles_deg:
+        if abs(angle) > WHOLE_TURN_DEG:
+            rest = round(math.remainder(angle, WHOLE_TURN_DEG), 9) + 0.0
+            raise ValueError(f"{angle:g}° is more than a whole turn; give -360 to 360 ({rest:g}°, if it is meant)")
+    return angles_deg
+
+
+def angles_of_prisms(angles_deg: list[float]) -> list[float]:
+    """Return angles between the faces of prisms, in degrees, unchanged.
+
+    Raises:
+        ValueError: one is a right angle or more.
+    """
+    for angle in angles_deg:
+        if abs(angle) >= RIGHT_ANGLE_DEG:
+            raise ValueError(f"{angle:g}° is no prism's; give the angle between its two faces, below 90")
+    return angles_deg
 
 
 def rotation_problem(rows: list[list[float]]) -> str | None:

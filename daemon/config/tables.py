@@ -9,9 +9,9 @@ from __future__ import annotations
 import datetime as dt
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
-from swath.daemon.config.rotations import with_matrix
+from swath.daemon.config.rotations import angles_of_prisms, with_matrix, within_a_turn
 
 NAME_PATTERN = r"^[A-Za-z0-9_-]+$"
 SIGNAL_PATTERN = r"^[A-Za-z_][A-Za-z0-9_]*\.[A-Za-z_][A-Za-z0-9_]*$"
@@ -20,7 +20,9 @@ Name = Annotated[str, Field(pattern=NAME_PATTERN, max_length=64)]
 Text = Annotated[str, Field(min_length=1)]
 Signal = Annotated[str, Field(pattern=SIGNAL_PATTERN)]
 Vector = Annotated[list[float], Field(min_length=3, max_length=3)]
-Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
+
+Angles = Annotated[list[float], Field(min_length=3, max_length=3), AfterValidator(within_a_turn)]
+Wedges = Annotated[list[float], Field(min_length=2, max_length=2), AfterValidator(angles_of_prisms)]
 Matrix = Annotated[list[Vector], Field(min_length=3, max_length=3)]
 SignalTriple = Annotated[list[Signal], Field(min_length=3, max_length=3)]
 
@@ -201,7 +203,7 @@ class ImuConfig(Section):
         default_factory=_identity,
         description="rotation from the IMU's axes to the body, by rows; also applied to the attitude of its INS",
     )
-    rotation_b_imu_deg: Vector | None = Field(
+    rotation_b_imu_deg: Angles | None = Field(
         None, description="instead of the matrix: its roll, pitch, yaw; see Angles of a mounting"
     )
     tick_hz: float | None = Field(
@@ -255,7 +257,7 @@ class GeometryConfig(Section):
     shaft_angle_deg: float | None = Field(
         None, gt=0.0, lt=90.0, description="nutating: angle between the mirror's shaft and the laser's beam"
     )
-    wedge_deg: Pair | None = Field(None, description="risley: wedge angles of the two prisms")
+    wedge_deg: Wedges | None = Field(None, description="risley: wedge angles of the two prisms")
     refractive_index: float | None = Field(None, gt=1.0, le=4.0, description="risley: refractive index of both prisms")
     prism_ratio: float | None = Field(
         None,
@@ -281,7 +283,7 @@ class GeometryConfig(Section):
 class GimbalStage(Section):
     """One stage of a gimbal, outermost first (FORMULAS 2.1, NGA Eq. 3)."""
 
-    angles_deg: Vector = Field(default_factory=_zero_vector, description="fixed roll, pitch, yaw of the stage")
+    angles_deg: Angles = Field(default_factory=_zero_vector, description="fixed roll, pitch, yaw of the stage")
     lever_arm_m: Vector = Field(
         default_factory=_zero_vector, description="from this stage's centre to the next inner one"
     )
@@ -318,7 +320,7 @@ class ScannerConfig(Section):
     installation: Matrix | None = Field(
         None, description="rotation T from scanner to body axes, by rows; required for spinning heads, else identity"
     )
-    installation_deg: Vector | None = Field(
+    installation_deg: Angles | None = Field(
         None, description="instead of the matrix: its roll, pitch, yaw; see Angles of a mounting"
     )
     calibration: Text | None = Field(None, description="calibration file, relative to this file")

@@ -23,6 +23,7 @@ REFRACTIONS = ("none", "ardc", "spherical")
 ROTATION_TOLERANCE = 1e-6
 # in the units of the file: far beyond any true value, and within the range of squares
 LARGEST, LEAST_SIGMA = 1e18, 1e-15
+WHOLE_TURN_DEG = 360.0
 MOST = 65_535  # greatest number of channels, which have 16 bits, and limit of other counts
 ONE_TABLE = "give it once"
 TABLES = ("calibration", "parameters", "sigma", "held_sigma", "correlation", "ibrc", "range_offset", "facet", "beam")
@@ -296,6 +297,9 @@ class _Reader:
             return 0.0
         if abs(value) > LARGEST:
             self._wrong(f"{where}.{key}", f"got {value:g}, want a number, at most {LARGEST:g} either way")
+            return 0.0
+        if key.endswith("_deg") and "sigma" not in where and abs(value) > WHOLE_TURN_DEG:
+            self._wrong(f"{where}.{key}", f"{value:g}° is more than a whole turn; give -360 to 360")
             return 0.0
         return float(value)
 

@@ -211,14 +211,16 @@ class ImuTable(Section):
 class ParameterTable(Section):
     """``[scanner.<name>.true]`` and ``[…nominal]``: keys, signs and units of a calibration file."""
 
-    omega_deg: float = Field(0.0, description="boresight ω")
-    phi_deg: float = Field(0.0, description="boresight φ")
-    kappa_deg: float = Field(0.0, description="boresight κ")
+    omega_deg: float = Field(0.0, ge=-360.0, le=360.0, description="boresight ω")
+    phi_deg: float = Field(0.0, ge=-360.0, le=360.0, description="boresight φ")
+    kappa_deg: float = Field(0.0, ge=-360.0, le=360.0, description="boresight κ")
     range_offset_m: float = Field(0.0, description="offset, added to ranges")
     range_scale_ppm: float = Field(0.0, description="scale of ranges")
-    scan_angle_offset_deg: float = Field(0.0, description="the encoder's reading at the centre of the scan")
+    scan_angle_offset_deg: float = Field(
+        0.0, ge=-360.0, le=360.0, description="the encoder's reading at the centre of the scan"
+    )
     scan_angle_scale_ppm: float = Field(0.0, description="scale of scan angles")
-    scan_plane_tilt_deg: float = Field(0.0, description="scan plane tilt Δη")
+    scan_plane_tilt_deg: float = Field(0.0, ge=-360.0, le=360.0, description="scan plane tilt Δη")
     lever_arm_x_m: float = Field(0.12, description="lever arm x_s^b, forward")
     lever_arm_y_m: float = Field(-0.03, description="lever arm x_s^b, right")
     lever_arm_z_m: float = Field(0.28, description="lever arm x_s^b, down")
@@ -240,15 +242,15 @@ class FacetTable(Section):
     """``[[scanner.<name>.facet]]``: a facet's own tilt (pyramid error)."""
 
     index: int = Field(ge=0, description="number of the facet, from 0")
-    tilt_deg: float = Field(description="tilt of its normal towards forward")
+    tilt_deg: float = Field(ge=-360.0, le=360.0, description="tilt of its normal towards forward")
 
 
 class BeamErrorTable(Section):
     """``[[scanner.<name>.beam]]``: corrections of one beam of a multi-beam head."""
 
     channel: int = Field(ge=0, description="number of the beam, from 0")
-    azimuth_deg: float = Field(0.0, description="correction, added to its azimuth")
-    elevation_deg: float = Field(0.0, description="correction, added to its elevation")
+    azimuth_deg: float = Field(0.0, ge=-360.0, le=360.0, description="correction, added to its azimuth")
+    elevation_deg: float = Field(0.0, ge=-360.0, le=360.0, description="correction, added to its elevation")
     range_m: float = Field(0.0, description="correction, added to its ranges")
 
 

@@ -248,7 +248,7 @@ HALF, ROOT_3 = 0.5, 0.75**0.5
         ([0, 90, 0], [[0, 0, 1], [0, 1, 0], [-1, 0, 0]]),  # nose up: x points up, z forward
         ([0, 0, 90], [[0, -1, 0], [1, 0, 0], [0, 0, 1]]),  # turned to the right: x points right, y backward
         ([0, 0, 30], [[ROOT_3, -HALF, 0], [HALF, ROOT_3, 0], [0, 0, 1]]),
-        ([0, 0, -450], [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
+        ([360, -360, -90], [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]),
         ([90, 0, 90], [[0, 0, 1], [1, 0, 0], [0, 1, 0]]),  # roll, then yaw about the body's z: x right, y down
         ([90, 90, 0], [[0, 1, 0], [0, 0, -1], [-1, 0, 0]]),  # roll, then pitch about the body's y: x up, y forward
     ],
@@ -277,6 +277,39 @@ def test_angles_of_a_mounting_beside_a_matrix_are_refused(tmp_path: Path) -> Non
         parse_config(with_session(head + both), tmp_path / "a.toml")
     with pytest.raises(ConfigError, match=r'installation_deg\[1\]: got "90", want a number'):
         parse_config(with_session(head + 'installation_deg = [0, "90", 0]\n'), tmp_path / "a.toml")
+
+
+@pytest.mark.parametrize(
+    ("head", "key", "line"),
+    [
+        (
+            "imu.main",
+            "rotation_b_imu_deg = [400, 0, 0]",
+            "400° is more than a whole turn; give -360 to 360 (40°, if it",
+        ),
+        (
+            "scanner.l",
+            "installation_deg = [0, 0, -361.5]",
+            "-361.5° is more than a whole turn; give -360 to 360 (-1.5°",
+        ),
+        ("scanner.l", "gimbal.stages = [{angles_deg = [0, 1e7, 0]}]", "1e+07° is more than a whole turn; give -360 to"),
+        (
+            "scanner.l",
+            'geometry = {type = "risley", wedge_deg = [3, 120]}',
+            "120° is no prism's; give the angle between",
+        ),
+        ("scanner.l", "installation_deg = [0, nan, 0]", "got NaN, want a finite number"),
+    ],
+)
+def test_angles_beyond_a_turn_are_refused(head: str, key: str, line: str, tmp_path: Path) -> None:
+    devices = {
+        "imu.main": 'transport = "can:socketcan:can0"\nprotocol = "canmod-gps"\n',
+        "scanner.l": 'transport = "udp:0.0.0.0:2368"\nprotocol = "srep"\n',
+    }
+    with pytest.raises(ConfigError) as refused:
+        parse_config(with_session(f"[{head}]\n{devices[head]}{key}\n"), tmp_path / "a.toml")
+    assert line in str(refused.value)
+    assert str(refused.value).startswith(f"{tmp_path / 'a.toml'}: {head}.{key.partition(' ')[0].partition('.')[0]}")
 
 
 TOML_VALUES = st.recursive(

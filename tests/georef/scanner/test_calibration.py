@@ -178,6 +178,7 @@ def test_changing_a_calibration_leaves_the_original_unchanged() -> None:
         ("omega_deg = 0", "", "parameters.omega_deg: missing, want a number"),
         ("omega_deg = 0", "omega_deg = true", "parameters.omega_deg: got True, want a number"),
         ("omega_deg = 0", "omega_deg = nan", "parameters.omega_deg: got nan, want a number"),
+        ("omega_deg = 0", "omega_deg = 400", "parameters.omega_deg: 400° is more than a whole turn; give -360 to 360"),
         ("omega_deg = 0", "omega_deg = 0\nomega_rad = 0", "parameters.omega_rad: not a parameter of the model"),
         (
             "[parameters]",
