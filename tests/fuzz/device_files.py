@@ -43,6 +43,8 @@ def device_file_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
     yield "geometry-hesai", partial(_files, "geometry-hesai", hesai)
     mirrors: Protocols = (("scanner", "hesai-at128"),)
     yield "geometry-hesai-at128", partial(_files, "geometry-hesai-at128", mirrors, _changed_and_sealed)
+    robosense: Protocols = (("scanner", "robosense-rs16"), ("scanner", "robosense-rs32"))
+    yield "geometry-robosense", partial(_files, "geometry-robosense", robosense)
     yield "geometry-ouster", partial(_files, "geometry-ouster", (("scanner", "ouster"),))
     heads: Protocols = (("scanner", "velodyne-vlp16"), ("scanner", "velodyne-vlp32c"))
     yield "geometry-velodyne", partial(_files, "geometry-velodyne", heads)

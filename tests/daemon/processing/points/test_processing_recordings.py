@@ -6,6 +6,7 @@ differences allowed are those of the parsers' own tests, which come from the dec
 
 from __future__ import annotations
 
+import gzip
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +28,7 @@ from swath.georef.scanner.calibration import nominal
 from swath.georef.scanner.sensor_model import SensorModel
 from swath.georef.trajectory.trajectory import Trajectory
 from tests.drivers import ouster_cases
+from tests.drivers.at128_cases import WALL_M
 from tests.drivers.builders import feed, returns_of
 from tests.drivers.recordings import FIXTURES
 from tests.drivers.spinning import are_near, payloads, read_pcd, xyz
@@ -212,6 +214,17 @@ def test_xt32_points_match_nebula() -> None:
     assert len(cloud) == 63021
     rows["encoder_rad"] -= XT32.offset_ns[0, rows["channel"]] * (XT32_RPM / 60 * 2 * np.pi * 1e-9)
     assert are_near(cloud, points_s(model_of("hesai-xt32", parser), rows), 1e-4).all()
+
+
+def test_points_of_an_at128_lie_on_the_wall_before_it() -> None:
+    """Packets of a wall at x = 40 m were made laser by laser by the maker's formulas; ranges are rounded to 4 mm."""
+    angles = gzip.decompress((FIXTURES / "hesai" / "at128.dat.gz").read_bytes())
+    parser = find_driver("scanner", "hesai-at128").make_parser(DeviceSettings("scanner/left", {}, {"geometry": angles}))
+    assert isinstance(parser, PacketParser)
+    rows = returns_of(feed(parser, payloads("hesai/made_at128.pcap.gz")))
+    points = points_s(model_of("hesai-at128", parser), rows)
+    assert len(points) > 8_000
+    np.testing.assert_allclose(points[:, 0], WALL_M, rtol=0, atol=0.0021)
 
 
 # ------------------------------------------------------------------------------------------------------------ Ouster
