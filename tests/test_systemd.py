@@ -287,6 +287,31 @@ def test_udev_rules_match_and_assign(rule: str) -> None:
     assert any(op in ("=", "+=") for op in operators), "a rule that does nothing"
 
 
+@pytest.mark.parametrize("serial", ["", "FT4XYZ12"])
+def test_every_named_device_has_one_link_that_ends_in_what_tells_it_apart(serial: str) -> None:
+    """By-id links of u-blox receivers in public configurations have no serial number."""
+    named = {"ID_SERIAL_SHORT": serial, "ID_PATH": "pci-0000:00:14.0-usb-0:1:1.0", "ID_USB_INTERFACE_NUM": "00"}
+    for vendor, beginning in (("1546", "gnss/ublox-"), ("152a", "gnss/septentrio-"), ("0403", "adapter/")):
+        links = []
+        for rule in _udev_rules():
+            terms = [match for term in rule.split(", ") if (match := _UDEV_TERM.fullmatch(term))]
+            fields = [(match["key"], match["op"], match[0].partition('"')[2][:-1]) for match in terms]
+            if ("ATTRS{idVendor}", "==", vendor) not in fields or any(
+                key == "ATTRS{idProduct}" for key, _, _ in fields
+            ):
+                continue
+            wanted = [
+                (key[4:-1], op, value) for key, op, value in fields if key.startswith("ENV{ID_") and op in ("==", "!=")
+            ]
+            if all((named.get(key, "") == value) == (op == "==") for key, op, value in wanted):
+                links += [value for key, _, value in fields if key == "SYMLINK"]
+        assert len(links) == (1 if serial or vendor != "0403" else 0)
+        for link in links:
+            expanded = re.sub(r"\$env\{(\w+)\}", lambda match: named[match[1]], link)
+            assert expanded.startswith(beginning)
+            assert len(expanded) > len(beginning)
+
+
 def _udev_examples() -> list[str]:
     lines = (SYSTEMD / "udev/90-swath.rules").read_text().splitlines()
     return [line[1:] for line in lines if line.startswith("#SUBSYSTEM")]
