@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from swath.daemon.config import parse_config
 from swath.daemon.devices.check import check_everything
 from swath.daemon.errors import ConfigError
 from swath.daemon.log.reader import open_logs
+from swath.daemon.monitor.display import Monitor
 from swath.daemon.processing.navigation.log import read_navigation_log
 from swath.daemon.processing.navigation.sources import NavigationSources
 from swath.daemon.processing.points.clocks import read_clocks
@@ -19,7 +22,8 @@ from swath.daemon.processing.setup.sources import Sources
 from swath.drivers.scanner.livox.layout import IMU_2, NO_SYNC, POINTS_2, encode_packet_2
 from swath.georef.records import ImuSamples
 from tests.daemon.exchange.builders import Unit, write_config, write_log
-from tests.daemon.rig import free_udp_port, session_table
+from tests.daemon.log_check import read_log
+from tests.daemon.rig import Recorder, free_udp_port, session_table
 from tests.daemon.wires import udp_sender
 from tests.drivers.livox_cases import FILES
 
@@ -80,6 +84,25 @@ def test_check_gives_the_imu_a_line_of_its_own(tmp_path: Path, own: bool) -> Non
     assert reports["scanner/top"].records["ScannerReturns"] > 0
     assert reports["imu/inner"].records.keys() == {"ImuSamples", "DeviceClockSamples"}
     assert ("scanner/top/aux" in reports) == (not own)
+
+
+@pytest.mark.slow  # until rates are shown
+def test_the_recorder_logs_it_once_and_the_monitor_shows_it(tmp_path: Path) -> None:
+    data, second = free_udp_port(), free_udp_port()
+    text = session_table(tmp_path / "logs") + HEAD.format("top", data, "mid360")
+    text += f'auxiliary = "udp:127.0.0.1:{second}"\n' + INSIDE.format("top", "mid360")
+    with udp_sender(data, points), udp_sender(second, sample), Recorder(tmp_path / "rig", text) as recorder:
+        monitor, shown = Monitor(tmp_path / "logs"), dict[str, Any]()
+        until = time.monotonic() + 20
+        while "ImuSamples" not in shown.get("imu/inner", {}).get("decoded", {}).get("records_hz", {}):
+            assert time.monotonic() < until, shown
+            time.sleep(0.2)
+            monitor.poll()
+            shown = monitor.snapshot()["sources"]
+        monitor.close()
+        assert recorder.stop() == 0, recorder.stderr()
+    assert shown["imu/inner"]["state"] == "in scanner/top"
+    assert set(read_log(tmp_path / "logs").units) == {"scanner/top", "scanner/top/aux"}
 
 
 @pytest.mark.parametrize(
