@@ -346,7 +346,8 @@ def _answer_problems(reading: Reading) -> list[str]:
     if entry.protocol == RAW:
         return []
     good = counters.messages.total()
-    other = not_understood(entry, heard, good, reading.kept, refused=counters.bad_messages)
+    remarks = reading.parser.remarks()
+    other = not_understood(entry, heard, good, reading.kept, refused=counters.bad_messages, remarks=remarks)
     if other is not None:
         return [other]
     found: list[str] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -142,7 +143,13 @@ def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | Non
 
 
 def not_understood(
-    entry: DeviceEntry, heard: Heard, messages: int, kept: list[ChunkBatch], *, refused: int = 0
+    entry: DeviceEntry,
+    heard: Heard,
+    messages: int,
+    kept: list[ChunkBatch],
+    *,
+    refused: int = 0,
+    remarks: Sequence[str] = (),
 ) -> str | None:
     """Return a line if a device uses another protocol than the configured one, or no known protocol; None if it is
     understood.
@@ -154,12 +161,15 @@ def not_understood(
         kept: the bytes, or the first of them.
         refused: number of messages that it could not decode. If they outnumber the good ones, the device counts as not
             understood: a head's second port may be readable although the head is another model, whose own port is not.
+        remarks: of the configured parser on what it cannot read; they are better than a guess.
     """
     if entry.protocol == RAW or (messages and heard.counts and refused <= messages):
         return None
     other = identify(entry, kept, than=messages)
     if other is not None:
         return f"sends {other}, but {entry.protocol} is configured"
+    if remarks and not heard.counts:
+        return "; ".join(line.removeprefix(f"{entry.source}: ") for line in remarks)
     if messages:
         return None
     hint = {"serial": "; check the baud rate", "tcp": "; check the port number"}.get(entry.transport.kind, "")

@@ -143,7 +143,9 @@ class SourceNumbers:
             }
         elif self.parser is not None:
             counters = self.parser.counters
-            numbers["degraded"] = stream_faults(counters.errors, counters.messages.total(), duration_s)
+            numbers["degraded"] = stream_faults(
+                counters.errors, counters.messages.total(), duration_s, counters.bad_checksums
+            )
             numbers["decoded"] = {
                 "messages": dict(counters.messages),
                 "records": dict(self.records),

@@ -6,24 +6,28 @@ import time
 from collections.abc import Mapping
 
 FAULTY_SHARE = 0.001  # of the messages; more restarts, incomplete, repeated or late ones degrade a source
+DAMAGED_SHARE = 0.01  # bytes between messages may look like one
 RESTART_EVERY_S = 60.0
 _FAULTS = (("_incomplete", "incomplete"), ("duplicate", "repeated"), ("out_of_order", "out of order"))
 
 
-def stream_faults(errors: Mapping[str, int], messages: int, seconds: float) -> list[str]:
+def stream_faults(errors: Mapping[str, int], messages: int, seconds: float, damaged: int = 0) -> list[str]:
     """Describe what degrades a source's stream, in a few words each: more than one in a thousand of its messages is
-    incomplete, repeated or out of order, or its device restarts as often or once a minute.
+    incomplete, repeated or out of order, or one in a hundred damaged, or its device restarts as often or once a minute.
 
     Args:
         errors: counts of its parser by code.
         messages: number of its messages.
         seconds: duration of the stream.
+        damaged: number of messages whose checksum is wrong.
     """
     least = FAULTY_SHARE * max(messages, 1)
     restarts = sum(count for code, count in errors.items() if code.endswith("restart"))
     found = []
     if restarts and (restarts > least or restarts * RESTART_EVERY_S >= seconds):
         found.append(f"{restarts} restart{'s' if restarts > 1 else ''}")
+    if damaged > DAMAGED_SHARE * max(messages, 1) and damaged > 1:  # a stream may begin inside a message
+        found.append(f"{damaged} damaged ({100.0 * damaged / max(messages + damaged, 1):.2g} % of its messages)")
     for ending, words in _FAULTS:
         count = sum(number for code, number in errors.items() if code.endswith(ending))
         if count > least:

@@ -63,4 +63,6 @@ def judge(entry: DeviceEntry, kept: list[ChunkBatch]) -> str | None:
         heard.add(parser.feed_batch(batch))
     heard.add(parser.close())
     counters = parser.counters
-    return not_understood(entry, heard, counters.messages.total(), kept, refused=counters.bad_messages)
+    messages = counters.messages.total()  # a receiver that is understood may be silent about time until it has a fix
+    remarks = [] if messages else parser.remarks()
+    return not_understood(entry, heard, messages, kept, refused=counters.bad_messages, remarks=remarks)

@@ -32,6 +32,7 @@ FALSE_SYNC = -1  # … this is not a frame
 MAX_NAMES = 1024  # names of messages that are counted separately; a receiver sends a few dozen
 OTHER_NAMES = "other"
 OVER_BOUND = -2  # … the stated length exceeds the protocol's longest frame; counted
+NO_CHECKSUM = -3  # … a whole frame, but for its checksum; counted
 
 
 class Frame(NamedTuple):
@@ -57,7 +58,8 @@ class FrameKind:
         sync: the bytes allowed at each of a frame's first positions.
         max_bytes: length of the longest frame, the most that a false sync can hold back.
         measure: ``(buffer, start, final)`` -> length of the frame at ``start`` in bytes, which may end beyond the
-            buffer; or `UNDECIDED`, `FALSE_SYNC`, `OVER_BOUND`. ``final`` means that the stream has ended.
+            buffer; or `UNDECIDED`, `FALSE_SYNC`, `OVER_BOUND`, `NO_CHECKSUM`. ``final`` means that the stream has
+            ended.
         intact: whether the checksum of a complete frame is good.
         message_name: the name under which a good frame is counted.
         marks: returns, for up to twice ``max_bytes``, one number for each place between bytes; the numbers at two
@@ -190,6 +192,8 @@ class Framer:
             length = there + 1
         elif length == OVER_BOUND:
             self.counters.errors[f"{kind.name}_length_over_bound"] += 1
+        elif length == NO_CHECKSUM:
+            self.counters.errors[f"{kind.name}_without_checksum"] += 1
         return 0 if final or length < 0 else length
 
     def _arrival(self, end_offset: int) -> int:

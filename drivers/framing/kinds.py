@@ -7,7 +7,7 @@ import struct
 from functools import lru_cache
 
 from swath.drivers.framing.checksums import crc16_ccitt, crc24q, crc24q_marks, crc32_novatel, nmea_xor, ubx_fletcher
-from swath.drivers.framing.framer import FALSE_SYNC, OVER_BOUND, UNDECIDED, FrameKind
+from swath.drivers.framing.framer import FALSE_SYNC, NO_CHECKSUM, OVER_BOUND, UNDECIDED, FrameKind
 
 # --- NMEA 0183: $ttsss,field,…*hh CR LF -----------------------------------------------------------------------------
 
@@ -19,6 +19,7 @@ NMEA_NUMBER_END = 9  # end of the number in $PUBX,00,
 NMEA_SENTENCE = re.compile(rb"[$!][A-Z][ -#%%-)+-~]{0,%d}\*[0-9A-Fa-f]{2}\r?\n" % (NMEA_MAX_BYTES - 7))
 NMEA_BODY = re.compile(rb"[$!][A-Z][ -#%-)+-~]*")  # printable, neither $ (a new sentence) nor * (the checksum)
 NMEA_CHECKSUM = re.compile(rb"\*[0-9A-Fa-f]{2}")
+NMEA_UNCHECKED = re.compile(rb"[$!][A-Z]{2}[A-Z0-9]{1,13},[ -#%-)+-~]*\r?\n")  # up to its line end, without a star
 NMEA_ADDRESS = re.compile(rb"[$!]([A-Z0-9]+)(?:,(\d\d)(?=[,*]))?")
 
 
@@ -31,9 +32,12 @@ def measure_nmea(buffer: bytes, start: int, final: bool) -> int:
     star = body.end() if body else min(start + 1, len(buffer))
     if star - start > NMEA_MAX_BYTES - 5:
         return FALSE_SYNC
+    if star < len(buffer) and buffer[star] != 0x2A:
+        if buffer[star:] == b"\r" and not final:
+            return UNDECIDED
+        return NO_CHECKSUM if NMEA_UNCHECKED.match(buffer, start) else FALSE_SYNC
     if star + 3 > len(buffer):
-        plausible = star == len(buffer) or buffer[star] == 0x2A
-        return UNDECIDED if plausible else FALSE_SYNC
+        return UNDECIDED
     if not body or not NMEA_CHECKSUM.match(buffer, star):
         return FALSE_SYNC
     ending = buffer[star + 3 : star + 5]

@@ -117,10 +117,12 @@ class NmeaDecoder:
 
     def __init__(self, settings: DeviceSettings, counters: ParserCounters, *, time_only: bool = False) -> None:
         self.counters = counters
+        self._source = settings.source
         self._dates = ReceiverDates(settings)
         self._epochs: EpochGatherer[Part] = EpochGatherer(self.counters)
         self._time_only = time_only
         self._has_fix: bool | None = None  # whether the latest GGA, GNS or RMC has a fix
+        self._without_time = 0  # GGA, GNS, RMC and ZDA without a time; −1 once one had it
         self._decoders: dict[bytes, Callable[[int, Sentence], list[Record]]] = {
             b"GGA": self._gga,
             b"GNS": self._gns,
@@ -153,8 +155,20 @@ class NmeaDecoder:
         return self._fixes(self._epochs.end())
 
     def remarks(self) -> list[str]:
-        """Return remarks on the receiver's dates."""
-        return self._dates.remarks()
+        """Return remarks on the receiver's dates, on sentences without checksum, and on sentences without content."""
+        remarks = self._dates.remarks()
+        unchecked = self.counters.errors["nmea_without_checksum"]
+        if unchecked > self.counters.messages.total():
+            remarks.append(
+                f"{self._source}: {unchecked:,} sentences have no checksum and are not read; switch the checksum on in "
+                "the receiver"
+            )
+        if self._without_time > 0:
+            remarks.append(
+                f"{self._source}: its {self._without_time:,} sentences of time and position are empty: the receiver "
+                "knows neither; give its antenna a free view of the sky, and check the antenna's cable and power"
+            )
+        return remarks
 
     # --- sentences ---
 
@@ -171,7 +185,7 @@ class NmeaDecoder:
         return self._solution(host_time_ns, sentence, FIX_TYPE_BY_MODE[mode], "GNS")
 
     def _solution(self, host_time_ns: int, sentence: Sentence, fix_type: FixType, name: str) -> list[Record]:
-        time_ns, position = sentence.time_ns(), sentence.position_rad()
+        time_ns, position = self._known(sentence.time_ns()), sentence.position_rad()
         altitude, separation = sentence.number("altitude"), sentence.number("geo_sep")
         satellites = sentence.number("num_sats")
         self._has_fix = fix_type in VOUCHED
@@ -187,7 +201,7 @@ class NmeaDecoder:
         return self._add(name, part)
 
     def _rmc(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
-        time_ns, date = sentence.time_ns(), self._meant(sentence.date_ddmmyy(), host_time_ns)
+        time_ns, date = self._known(sentence.time_ns()), self._meant(sentence.date_ddmmyy(), host_time_ns)
         position, speed = sentence.position_rad(), sentence.number("spd_over_grnd")
         velocity = velocity_from_course(None if speed is None else speed * MPS_PER_KNOT, sentence.number("true_course"))
         fix_type = FIX_TYPE_BY_MODE.get(sentence.text("mode_indicator"), FixType.NONE)
@@ -199,7 +213,7 @@ class NmeaDecoder:
         return records + self._add("RMC", part)
 
     def _zda(self, host_time_ns: int, sentence: Sentence) -> list[Record]:
-        time_ns, date = sentence.time_ns(), self._meant(sentence.date_ymd(), host_time_ns)
+        time_ns, date = self._known(sentence.time_ns()), self._meant(sentence.date_ymd(), host_time_ns)
         records = self._time_message(host_time_ns, time_ns, date, self._has_fix is not False, "ZDA")
         return records + self._add("ZDA", Part(host_time_ns, time_ns, date=self._believed(date)))
 
@@ -293,6 +307,14 @@ class NmeaDecoder:
 
     # --- time and epochs ---
 
+    def _known(self, time_ns: int | None) -> int | None:
+        """Count the sentences without a time before the first one that has it; return the time."""
+        if time_ns is not None:
+            self._without_time = -1
+        elif self._without_time >= 0:
+            self._without_time += 1
+        return time_ns
+
     def _time_message(
         self, host_time_ns: int, time_ns: int | None, date: dt.date | None, vouched: bool, name: str
     ) -> list[Record]:
@@ -374,7 +396,7 @@ class NmeaParser(FramedParser):
         return self._decoder.close()
 
     def remarks(self) -> list[str]:
-        """Return remarks on the receiver's dates."""
+        """Return remarks on the receiver's dates and sentences."""
         return self._decoder.remarks()
 
 

@@ -148,7 +148,7 @@ class DbcParser(PacketParser):
             layout = layouts[name]
             lines.append(
                 f"{count} values of {name} are outside the range {layout.minimum:g} to {layout.maximum:g} of the DBC; "
-                "correct the DBC file if its range is wrong"
+                "correct the DBC file if its range or the signal's byte order is wrong"
             )
         return tuple(lines)
 

@@ -241,7 +241,10 @@ def _multiplexing(message: Any, signals: dict[str, Any], signal: Any) -> tuple[S
         return None, frozenset()
     selector = signals[signal.multiplexer_signal]
     if selector.multiplexer_ids:
-        raise DriverSettingsError(f"signal {message.name}.{signal.name}: nested multiplexing is not supported")
+        raise DriverSettingsError(
+            f"signal {message.name}.{signal.name}: nested multiplexing is not supported: {selector.name}, which "
+            "selects it, is selected itself; want a DBC in which one multiplexer selects it"
+        )
     return signal_layout(message, selector), frozenset(int(value) for value in signal.multiplexer_ids)
 
 

@@ -184,6 +184,12 @@ def test_a_head_s_errors_stand_once_and_repeated_datagrams_degrade_it(tmp_path: 
     assert session["sources"]["scanner/roof"]["degraded"] == []
 
 
+def test_more_than_one_damaged_message_in_a_hundred_degrades_a_stream() -> None:
+    """A serial line that is too slow for its unit loses bytes (SBG-Systems/sbg_ros_driver #37)."""
+    assert stream_faults({}, 4500, 25.0, 500) == ["500 damaged (10 % of its messages)"]
+    assert stream_faults({}, 4500, 25.0, 45) == stream_faults({}, 0, 0.0, 1) == []
+
+
 @pytest.mark.parametrize(
     ("errors", "messages", "seconds", "said"),
     [

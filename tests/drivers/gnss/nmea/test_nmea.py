@@ -96,6 +96,35 @@ def test_only_the_broken_recordings_have_bad_messages() -> None:
     assert bad == {"april6_2019.log": 1, "tcp-torture.log": 1, "pygpsdata-nmeafoo2.log": 1}
 
 
+def test_sentences_without_checksum_are_counted_and_reported() -> None:
+    """Many receivers send them by default; the stream has 20 with a line end of either kind."""
+    text = b"".join(
+        b"$GPRMC,0900%02d.00,A,4728.92,N,00854.30,E,0.0,90.0,150626,,%s" % (at, (b"\r\n", b"\n")[at % 2])
+        for at in range(20)
+    )
+    checked_one = b"$GPVTG,,,,,,,,,N*30\r\n"
+    outcome = check_stream(make, text + checked_one + text[:50])
+    assert outcome.counters["errors"] == {"nmea_without_checksum": 20}
+    parser = make()
+    assert feed_pieces(parser, [text]) == []
+    assert parser.remarks() == [
+        "gnss/test: 20 sentences have no checksum and are not read; switch the checksum on in the receiver"
+    ]
+    feed_pieces(checked := make(), [recording("nmea", "ublox-zed-f9p-nmea.log"), text[:64]])
+    assert checked.remarks() == []
+
+
+def test_empty_sentences_are_reported_until_the_receiver_knows_its_time() -> None:
+    """The sentences of a receiver without sky (ros-drivers/nmea_navsat_driver #5)."""
+    empty = b"$GPGGA,,,,,,0,,,,,,,,*66\r\n$GPRMC,,V,,,,,,,,,,N*53\r\n$GPGLL,,,,,,V,N*64\r\n$GPVTG,,,,,,,,,N*30\r\n"
+    parser = make()
+    assert feed_pieces(parser, [empty * 3]) == []
+    (remark,) = parser.remarks()
+    assert remark.startswith("gnss/test: its 6 sentences of time and position are empty: the receiver knows neither")
+    feed_pieces(parser, [recording("nmea", "ublox-zed-f9p-nmea.log")])
+    assert parser.remarks() == []
+
+
 def test_a_date_one_rollover_behind_is_invalid_and_counted() -> None:
     """april6_2019.log comes from a receiver that sends 1999 after the roll-over of 2019-04-06."""
     parser = make()

@@ -145,7 +145,7 @@ def test_nested_multiplexing_is_refused() -> None:
         ' SG_ B m1M : 8|8@1+ (1,0) [0|0] "" X\n SG_ C m2 : 16|8@1+ (1,0) [0|0] "" X\n\nSG_MUL_VAL_ 100 B A 1-1;\n'
         "SG_MUL_VAL_ 100 C B 2-2;\n"
     )
-    with pytest.raises(DriverSettingsError, match=r"M.C: nested multiplexing"):
+    with pytest.raises(DriverSettingsError, match=r"M.C: nested multiplexing is not supported: B, which"):
         find_signal(load_database(text.encode()), "M.C", "imu.dbc")
 
 
