@@ -54,6 +54,7 @@ IMPORTED_LATE = {
     },
     "swath.daemon.simulate.plans": {"swath.sim"},  # the only import of the virtual aircraft
     "swath.daemon.system": {"psutil"},
+    "swath.drivers.captures.opening": {"swath.drivers.captures.rosbag.bag"},  # rosbags
     "swath.drivers.imu.dbc.signals": {"cantools.database"},
     "swath.drivers.scanner.rows.filler": {"swath.drivers.scanner.rows.compiled"},  # numba
     "swath.drivers.scanner.velodyne.calibration": {"yaml"},

@@ -1,16 +1,28 @@
 """Readers of recordings that other programs made: pcap and pcapng, ``candump -L`` text, serial bytes with arrival
-times, files of Livox Viewer.
+times, files of Livox Viewer, bags of ROS.
 
 Each yields the units that were on the wire, with the recorder's time, in the file's order; gzip is recognised by its
 magic. They serve import, replay, demonstrations and tests. A damaged file raises `TransportError` with one line, after
 the units before the bad place; a reader with a `CaptureTally` counts the damage instead.
 """
 
-from swath.drivers.captures.base import Address, CapturedUnit, CaptureTally, open_capture, read_beginning
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from swath.drivers.captures.base import Address, CapturedUnit, CaptureTally, open_capture, read_beginning, until_damage
 from swath.drivers.captures.candump import candump_line, held_by_line, is_candump, is_shown_candump, read_candump
 from swath.drivers.captures.lvx import LvxHead, is_lvx, read_lvx, read_lvx_heads, tells_time
 from swath.drivers.captures.pcap import is_pcap, read_pcap
+from swath.drivers.captures.rosbag.kinds import bag_kind
 from swath.drivers.captures.serial import BareTime, chunk_table, read_bare, read_serial, read_tagged
+from swath.drivers.extras import how_to_install
+from swath.drivers.transports.base import TransportError
+
+if TYPE_CHECKING:
+    from swath.drivers.captures.rosbag.bag import Bag
 
 __all__ = [
     "Address",
@@ -18,6 +30,7 @@ __all__ = [
     "CaptureTally",
     "CapturedUnit",
     "LvxHead",
+    "bag_kind",
     "candump_line",
     "chunk_table",
     "held_by_line",
@@ -25,7 +38,9 @@ __all__ = [
     "is_lvx",
     "is_pcap",
     "is_shown_candump",
+    "open_bag",
     "open_capture",
+    "read_bag",
     "read_bare",
     "read_beginning",
     "read_candump",
@@ -36,3 +51,36 @@ __all__ = [
     "read_tagged",
     "tells_time",
 ]
+
+
+def open_bag(path: Path) -> Bag:
+    """Open a bag's file or folder, to be used in a ``with`` statement.
+
+    Raises:
+        TransportError: it is not a bag that can be read, or rosbags is not installed.
+    """
+    try:
+        from swath.drivers.captures.rosbag.bag import Bag
+    except ImportError as error:
+        raise TransportError(
+            f"{path}: bags need rosbags, which is not installed: {how_to_install('import')}"
+        ) from error
+    return Bag(path)
+
+
+def read_bag(path: Path, names: Sequence[str], tally: CaptureTally | None = None) -> Iterator[CapturedUnit]:
+    """Read the units of some topics of a bag, in the order of its messages.
+
+    Each unit has the time that the message gives for it (the stamp of its packet, else that of the message's header),
+    or the bag's time of the message where that stamp is absent or 0.
+
+    Args:
+        path: a bag's file or folder.
+        names: of its topics, as `Bag.topics` has them.
+        tally: counts damaged messages; where None, they are raised.
+
+    Raises:
+        TransportError: it is not a bag that can be read; without tally also: it is damaged.
+    """
+    with open_bag(path) as bag:
+        yield from until_damage(bag.units(names, tally), tally)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import random
 import tempfile
@@ -11,8 +12,19 @@ from pathlib import Path
 
 from swath.daemon.config import load_config
 from swath.daemon.errors import UserError
-from swath.drivers.captures.opening import CaptureTally, read_candump, read_lvx, read_pcap, read_serial, tells_time
+from swath.drivers.captures.base import until_damage
+from swath.drivers.captures.opening import (
+    CaptureTally,
+    open_bag,
+    read_candump,
+    read_lvx,
+    read_pcap,
+    read_serial,
+    tells_time,
+)
+from swath.drivers.captures.rosbag.messages import SENTENCE
 from swath.drivers.transports.base import TransportError
+from tests.drivers.captures.bags import CONTAINERS, Ros, every_type, write_bag
 from tests.drivers.livox_cases import FILES
 from tests.drivers.lvx_files import FileHead, lvx1_package, lvx2_package, lvx_file
 from tests.drivers.recordings import FIXTURES
@@ -55,6 +67,7 @@ def file_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
     yield "candump", lambda: _captures("candump", _heads("nmea2000/*.log.gz", "canmod-gps/*.log.gz"), read_candump)
     yield "lvx", lambda: _captures("lvx", _lvxs(), _read_lvx)
     yield "serial", lambda: _captures("serial", [_serial_case()], _read_serial)
+    yield "bag", _bags
     yield "config", _configuration
 
 
@@ -115,6 +128,27 @@ def _read_serial(path: Path, tally: CaptureTally | None) -> Iterator[object]:
     bare.write_bytes(data)
     chunks.write_bytes(table)
     return read_serial(bare, chunks, tally=tally)
+
+
+# --- bags of ROS ----------------------------------------------------------------------------------------------------
+
+_FUZZED_TYPES = ("pandar_msgs/msg/PandarScan", "nebula_msgs/msg/NebulaPackets", "can_msgs/msg/Frame", SENTENCE)
+
+
+def _bags() -> Target:
+    seeds = []
+    with tempfile.TemporaryDirectory(prefix="swath-fuzz-") as folder:
+        for container in CONTAINERS:
+            messages = [one for one in every_type(Ros(container))[0] if one[1] in _FUZZED_TYPES]
+            seeds.append(write_bag(Path(folder, container), container, messages).read_bytes())
+    target = _captures("bag", seeds, _read_bag)
+    # rosbags asks for as many bytes as a damaged length says, and gets those of the file
+    return dataclasses.replace(target, peak_bytes=lambda size: 5 << 30)
+
+
+def _read_bag(path: Path, tally: CaptureTally | None) -> Iterator[object]:
+    with open_bag(path) as bag:
+        yield from until_damage(bag.units(list(bag.topics), tally), tally)
 
 
 # --- the configuration ----------------------------------------------------------------------------------------------
