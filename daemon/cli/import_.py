@@ -31,14 +31,16 @@ MOST_OF_CAPTURES = 1.2  # size of a log by that of its captures; what is of othe
 
 
 def command(
-    config: Annotated[Path, typer.Argument(metavar="CONFIG", help="Configuration that describes the devices.")],
-    output: Annotated[Path, typer.Option("--output", "-o", metavar="DIR", help="Directory for the log.")],
+    config: Annotated[
+        Path, typer.Argument(metavar="CONFIG", help="Configuration that describes the devices; with --list, a bag.")
+    ],
     files: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="FILE…", help="pcap, pcapng, candump -L, lvx or lvx2 files, or the folder of an export."
+            metavar="FILE…", help="pcap, pcapng, candump -L, lvx or lvx2 files, bags, or the folder of an export."
         ),
     ] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", metavar="DIR", help="Directory for the log.")] = None,
     source: Annotated[
         list[str] | None,
         typer.Option(metavar="KIND/NAME[:WHICH]=FILE", help="The device whose bytes FILE holds; repeatable."),
@@ -54,24 +56,33 @@ def command(
     keep_copies: Annotated[
         bool, typer.Option("--keep-copies", help="Keep duplicate packets; default: drop the second copy.")
     ] = False,
+    list_: Annotated[
+        bool, typer.Option("--list", help="List what of a ROS bag can be imported, and propose a configuration.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """Make a log from captures of tcpdump, candump, str2str or Livox Viewer, or from the files of `swath export`.
+    """Make a log from captures of tcpdump, candump, str2str or Livox Viewer, ROS bags, or files of `swath export`.
 
     CONFIG's UDP ports and CAN interfaces assign the units of pcap files and candump logs to devices; a serial stream
-    needs --source. Exit code 4 when a capture is damaged, 1 when a capture holds nothing from CONFIG's devices.
+    needs --source. The topics of a bag go to the devices of their protocols, or are named by --source. Exit code 4 when
+    a capture is damaged, 1 when a capture holds nothing from CONFIG's devices.
     """
     from swath.daemon.config import load_config
     from swath.daemon.exchange.capture_files import ImportOptions, find_captures
     from swath.daemon.exchange.routes import Routes
     from swath.daemon.free_space import check_space
 
+    if list_:
+        _list([config, *(files or ())], as_json)
+        return
+    if output is None:
+        raise UserError("import: want -o DIR, the directory for the log (or --list BAG)", ExitCode.USAGE)
     logging.getLogger("swath").addHandler(logging.NullHandler())  # findings about captures are printed below
     options = ImportOptions(source or (), _by_source(start, _time_ns), _by_source(baud, _baud), keep_copies)
     loaded = load_config(config)
     routes = Routes.of(loaded)
     captures = find_captures(routes, files or (), options)
-    size = sum(capture.path.stat().st_size for capture in captures if capture.path.exists())
+    size = sum(path.stat().st_size for capture in captures for path in capture.files() if path.exists())
     check_space(output, "logs", least_bytes=0.0, most_bytes=MOST_OF_CAPTURES * size)
     report = _import(loaded, routes, captures, output)
     if as_json:
@@ -84,6 +95,20 @@ def command(
     lines += [_of_nobody(capture, routes) for capture in captures if not capture.units and not capture.tally.damage]
     if lines:
         raise UserError("\n".join(map(one_line, lines)), ExitCode.DAMAGE if damaged else ExitCode.PROBLEM)
+
+
+def _list(bags: list[Path], as_json: bool) -> None:
+    from swath.daemon.exchange.bag_listing import list_bag
+    from swath.drivers.transports.base import TransportError
+
+    try:
+        listings = [list_bag(path) for path in bags]
+    except TransportError as error:
+        raise UserError(one_line(str(error)), ExitCode.IO) from error
+    if as_json:
+        print(json.dumps({"bags": [listing.plain() for listing in listings]}, indent=2))
+    else:
+        print("\n".join(listing.text() for listing in listings), end="")
 
 
 def _import(config: Config, routes: Routes, captures: list[Capture], output: Path) -> ImportReport:
@@ -182,6 +207,10 @@ def _damage(capture: Capture) -> str:
 
 def _of_nobody(capture: Capture, routes: Routes) -> str:
     there = ", ".join(f"{what} ({count})" for what, count in capture.passed.most_common(5))
+    if capture.kind == "bag":
+        held = there or "no messages with the bytes of a device"
+        gives = "proposes a configuration" if there else "lists its topics"
+        return f"{capture.path}: holds {held}; `swath import --list {capture.path}` {gives}"
     if not there:
         return f"{capture.path}: is empty"
     return (

@@ -10,7 +10,7 @@ import numpy as np
 
 from swath.daemon.config import CorrectionsConfig, DeviceEntry, DeviceTable, GnssConfig, ImuConfig, ScannerConfig
 from swath.drivers.driver import RAW, all_drivers, find_driver
-from swath.drivers.parser import DeviceSettings, DriverSettingsError
+from swath.drivers.parser import DeviceKind, DeviceSettings, DriverSettingsError
 from swath.georef.records import ChunkBatch, DeviceClockSamples, ImuSamples, Record, TimeMessage, TimeTag
 
 LEAST_MESSAGES = 2  # a single frame may be chance
@@ -121,13 +121,32 @@ def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | Non
     their parsers frame each other's messages); the latter must find more than ``than``, the count of the configured
     protocol. A driver that needs settings which only the right configuration has is tried by its probe, or left out.
     """
-    best: list[str] = []
+    found = recognise(entry.kind, entry.transport.text, kept, than=than, but=entry.protocol)
+    return " or ".join(found.protocols) if found is not None else None
+
+
+@dataclass(frozen=True, slots=True)
+class Recognised:
+    """The protocol that decodes most of some bytes, with its number of records and of messages; several if scanners of
+    several protocols decode the same.
+    """
+
+    protocols: tuple[str, ...]
+    records: int
+    messages: int
+
+
+def recognise(
+    kind: DeviceKind, transport: str, kept: list[ChunkBatch], *, than: int = 0, but: str = ""
+) -> Recognised | None:
+    """Return the protocol of a kind that decodes most of the bytes, as `identify` has it; ``but`` is not tried."""
+    best: tuple[str, ...] = ()
     most = (0, max(than, LEAST_MESSAGES - 1))
-    for protocol, driver in all_drivers(entry.kind).items():
-        if protocol == entry.protocol:
+    for protocol, driver in all_drivers(kind).items():
+        if protocol == but:
             continue
         try:
-            parser = (driver.make_probe or driver.make_parser)(_default_settings(entry, protocol))
+            parser = (driver.make_probe or driver.make_parser)(_default_settings(kind, transport, protocol))
         except DriverSettingsError:
             continue
         heard = Heard()
@@ -136,10 +155,10 @@ def identify(entry: DeviceEntry, kept: list[ChunkBatch], than: int) -> str | Non
         heard.add(parser.close())
         found = (heard.counts.total(), parser.counters.messages.total())
         if found > most:
-            best, most = [protocol], found
-        elif found == most and best and entry.kind == "scanner":
-            best.append(protocol)
-    return " or ".join(best) or None
+            best, most = (protocol,), found
+        elif found == most and best and kind == "scanner":
+            best += (protocol,)
+    return Recognised(best, *most) if best else None
 
 
 def not_understood(
@@ -176,18 +195,17 @@ def not_understood(
     return f"its data are neither {entry.protocol} nor another known {entry.kind} protocol{hint}"
 
 
-def _default_settings(entry: DeviceEntry, protocol: str) -> DeviceSettings:
+def _default_settings(kind: DeviceKind, transport: str, protocol: str) -> DeviceSettings:
     """Return settings of a device of which only the protocol is known; values that framing does not need are
     placeholders.
     """
-    transport = entry.transport.text
     table: DeviceTable
-    if entry.kind == "gnss":
+    if kind == "gnss":
         table = GnssConfig(transport=transport, protocol=protocol)
-    elif entry.kind == "imu":
+    elif kind == "imu":
         table = ImuConfig(transport=transport, protocol=protocol, tick_hz=1_000_000.0)
-    elif entry.kind == "corrections":
+    elif kind == "corrections":
         table = CorrectionsConfig(transport=transport, protocol=protocol)
     else:
         table = ScannerConfig(transport=transport, protocol=protocol, mirror_factor=1.0, installation=IDENTITY)
-    return DeviceSettings(entry.source, table.model_dump())
+    return DeviceSettings(f"{kind}/unnamed", table.model_dump())

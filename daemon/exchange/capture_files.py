@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from swath.daemon.errors import ExitCode, UserError, one_line
+from swath.daemon.exchange.bags import BagChoice
 from swath.daemon.exchange.captures import Capture, has_times
 from swath.daemon.exchange.export import MANIFEST
 from swath.daemon.exchange.routes import Port, Routes
@@ -18,6 +19,7 @@ from swath.daemon.log.format import LogError, safe_attachment_path
 from swath.drivers.captures.opening import (
     BareTime,
     LvxHead,
+    bag_kind,
     is_candump,
     is_lvx,
     is_pcap,
@@ -31,14 +33,20 @@ from swath.drivers.transports.base import TransportError
 _LOOKED_AT_BYTES = 65_536
 _LOOKED_AT_LINES = 10
 _MAX_MANIFEST_BYTES = 1 << 20
-_KIND_OF_PORT = {"udp": "pcap", "can": "candump", "serial": "serial", "tcp": "serial", "pps": "pps"}
+_KIND_OF_PORT = {
+    "udp": "pcap",
+    "can": "candump",
+    "serial": "serial",
+    "tcp": "serial",
+    "ntrip": "serial",
+    "pps": "pps",
+}
 _NO_CAPTURE = {  # first bytes of files that hold device bytes in a format that cannot be imported
-    b"SQLite format 3\0": "a ROS 2 bag, or another SQLite file",
-    b"#ROSBAG V": "a ROS 1 bag",
-    b"\x89MCAP0\r\n": "a log, or a ROS 2 bag in MCAP",
+    b"\x89MCAP0\r\n": "MCAP, but no ROS 2 bag",
+    b"\x28\xb5\x2f\xfd": "compressed with zstd; of a bag give the folder with its metadata.yaml",
     b"LOGG": "a BLF file of Vector",
 }
-_WANTED = "want kind/name=FILE, kind/name:<CAN interface>=FILE or kind/name:<UDP port>=FILE"
+_WANTED = "want kind/name=FILE, kind/name:<CAN interface>=FILE, kind/name:<UDP port>=FILE or kind/name:<topic>=BAG"
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,33 +79,42 @@ def find_captures(routes: Routes, files: Sequence[Path], options: ImportOptions)
     ]
     unreadable = 0
     items: list[str | Path] = [*options.named, *files]
+    bags = BagChoice(routes)
     for item in items:
         try:
-            for capture in _named(routes, item) if isinstance(item, str) else _found(routes, item):
+            for capture in _named(routes, item, bags) if isinstance(item, str) else _found(routes, item, bags):
                 _settle(capture, options)
                 source = capture.port.source if capture.port is not None else ""
                 found[capture.path, source, capture.selector] = capture
         except (UserError, TransportError) as error:
             wrong.append(one_line(str(error)))
             unreadable += isinstance(error, TransportError)
-    if not found and not wrong:
+    try:
+        captures = [*found.values(), *bags.captures()]
+    except UserError as error:
+        wrong += map(one_line, error.message.splitlines())
+        captures = []
+    if not captures and not wrong:
         wrong.append("nothing to import; give captures or the folder of an export")
     if wrong:
         raise UserError("\n".join(wrong), ExitCode.IO if unreadable == len(wrong) else ExitCode.USAGE)
-    return list(found.values())
+    return captures
 
 
-def _named(routes: Routes, text: str) -> list[Capture]:
-    """Parse ``--source kind/name:selector=FILE``."""
+def _named(routes: Routes, text: str, bags: BagChoice) -> list[Capture]:
+    """Parse ``--source kind/name:selector=FILE``; a bag goes to ``bags``."""
     name, equals, file = text.partition("=")
     source, _, selector = name.partition(":")
     if not equals or not file or not source:
         raise UserError(f"--source {text}: {_WANTED}")
     path = Path(file)
     port = _port(routes, source, f"--source {text}")
-    kind = _kind(read_beginning(path, _LOOKED_AT_BYTES)[0])
+    kind = _kind(path, b"" if bag_kind(path, b"") else read_beginning(path, _LOOKED_AT_BYTES)[0])
     if kind == "lvx":
         return [_named_heads(path, port, selector)]
+    if kind == "bag":
+        bags.name(path, port, selector)
+        return []
     wanted = _KIND_OF_PORT[port.kind]
     if (kind == "pcap") != (wanted == "pcap"):
         forms = {
@@ -118,17 +135,22 @@ def _port(routes: Routes, source: str, where: str) -> Port:
     return port
 
 
-def _found(routes: Routes, path: Path) -> list[Capture]:
-    """Return a file whose units identify their own device, or all files of an export's folder."""
-    if path.is_dir():
+def _found(routes: Routes, path: Path, bags: BagChoice) -> list[Capture]:
+    """Return a file whose units identify their own device, or all files of an export's folder; a bag goes to
+    ``bags``.
+    """
+    if path.is_dir() and not bag_kind(path, b""):
         return _of_export(routes, path)
-    head, damage = read_beginning(path, _LOOKED_AT_BYTES)
-    kind = _kind(head)
+    head, damage = (b"", "") if path.is_dir() else read_beginning(path, _LOOKED_AT_BYTES)
+    kind = _kind(path, head)
+    if kind == "bag":
+        bags.add(path)
+        return []
     if kind == "serial":
         if damage:
             raise TransportError(f"{path}: cannot be read: {damage}")
         if other := next((what for magic, what in _NO_CAPTURE.items() if head.startswith(magic)), ""):
-            raise UserError(f"{path}: is {other}; want pcap, candump -L or the bytes of a device")
+            raise UserError(f"{path}: is {other}; want pcap, candump -L, a bag or the bytes of a device")
         if any(map(is_shown_candump, _first_lines(head))):
             raise UserError(f"{path}: is candump's format for people; want the output of candump -L (or -l)")
         raise UserError(
@@ -180,8 +202,10 @@ def _listed(heads: Mapping[str, LvxHead]) -> str:
     return ", ".join(named) or "no head"
 
 
-def _kind(head: bytes) -> str:
-    """Recognise a file by its beginning: pcap, lvx or candump, else the bytes of a serial line."""
+def _kind(path: Path, head: bytes) -> str:
+    """Recognise a file by its beginning: pcap, lvx, candump or a bag, else the bytes of a serial line."""
+    if bag_kind(path, head):
+        return "bag"
     if is_pcap(head):
         return "pcap"
     if is_lvx(head):

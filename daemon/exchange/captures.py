@@ -24,6 +24,7 @@ from swath.drivers.captures.opening import (
     BareTime,
     LvxHead,
     chunk_table,
+    read_bag,
     read_bare,
     read_candump,
     read_lvx,
@@ -49,15 +50,16 @@ class Capture:
     """A file to import, its kind, and counts of the units found in it.
 
     Attributes:
-        kind: "pcap", "candump", "serial", "lvx" or "pps".
+        kind: "pcap", "candump", "serial", "lvx", "bag" or "pps".
         port: the port whose units it holds; None if the units identify their ports themselves.
         selector: the only CAN interface, UDP port number, or head of an lvx file, whose units are used.
         time: timing of the bytes of a serial file without times.
         heads: of an lvx file, by code. head_ports: the ports of those that are used, by code. start_ns: of an lvx file
             whose packages have no UTC, the time at which it begins.
+        topics: of a bag, the topics that are read, with their ports.
         units: number used, by source.
         senders: of its datagrams, by source.
-        passed: number that belong to no device, by port or interface.
+        passed: number that belong to no device, by port, interface or topic.
     """
 
     path: Path
@@ -69,10 +71,15 @@ class Capture:
     heads: Mapping[str, LvxHead] = field(default_factory=dict)
     head_ports: Mapping[str, Port] = field(default_factory=dict)
     start_ns: int | None = None
+    topics: Mapping[str, Port] = field(default_factory=dict)
     tally: CaptureTally = field(default_factory=CaptureTally)
     units: Counter[str] = field(default_factory=Counter)
     passed: Counter[str] = field(default_factory=Counter)
     senders: dict[str, Senders] = field(default_factory=dict)
+
+    def files(self) -> list[Path]:
+        """Return the files of the disk that hold it."""
+        return sorted(path for path in self.path.iterdir() if path.is_file()) if self.path.is_dir() else [self.path]
 
     def read(self, routes: Routes) -> Iterator[ImportUnit]:
         """Yield the units that belong to a device, in the file's order; damage of the file is noted in ``tally``."""
@@ -93,6 +100,8 @@ class Capture:
         if self.kind == "pcap":
             units = read_pcap(self.path, tally=self.tally, drop_copies=not self.keep_copies)
             return complete(units, self.path)
+        if self.kind == "bag":
+            return read_bag(self.path, list(self.topics), self.tally)
         if self.kind == "candump":
             return complete(read_candump(self.path, tally=self.tally), self.path, within_ns=1000)
         if self.kind == "lvx":
@@ -112,6 +121,8 @@ class Capture:
     def _port_of(self, unit: CapturedUnit, routes: Routes) -> Port | None:
         if self.port is not None and self.selector is None and self.kind != "lvx":
             return self.port
+        if self.kind == "bag":
+            return self.topics.get(unit.channel)
         destination = str(unit.destination[1]) if unit.destination is not None else unit.channel
         if self.kind == "lvx":
             found = self.head_ports.get(unit.channel)

@@ -128,7 +128,7 @@ class ReadSoFar:
     """
 
     def __init__(self, captures: Iterable[Capture]) -> None:
-        paths = [capture.path.resolve() for capture in captures]
+        paths = [path.resolve() for capture in captures for path in capture.files()]
         self._sizes = Counter({path: path.stat().st_size for path in set(paths) if path.exists()})
         self._readers = Counter(path for path in paths if path in self._sizes)
         self.total = sum(self._sizes[path] * count for path, count in self._readers.items())

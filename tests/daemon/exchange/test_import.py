@@ -336,6 +336,15 @@ class TestSerialTimes:
         assert units[0][0] - START_NS == first_after_ns
         assert sum(len(data) for _, data, _ in units) == 1200
 
+    def test_corrections_of_a_caster_come_from_their_bytes(self, tmp_path: Path) -> None:
+        path = tmp_path / "base.rtcm"
+        path.write_bytes(bytes(600))
+        text = '[corrections.base]\ntransport = "ntrip:caster.example:2101/MOUNT"\nprotocol = "rtcm3"\n'
+        config = write_config(tmp_path, CONFIG + text)
+        options = ImportOptions([f"corrections/base={path}"], {"": START_NS})
+        report, _ = run_import(config, [], tmp_path / "logs", options)
+        assert report.units == {"corrections/base": 2}
+
     @pytest.mark.parametrize(
         "option",
         [["--start", "yesterday"], ["--start", "2027-01-15T08:00:00"], ["--start", "1969-01-01T00:00:00Z"],
@@ -405,17 +414,16 @@ class TestRefusals:
     @pytest.mark.parametrize(
         ("begins", "what"),
         [
-            (b"SQLite format 3\0\x10\0", "a ROS 2 bag, or another SQLite file"),
-            (b"#ROSBAG V2.0\n", "a ROS 1 bag"),
-            (b"\x89MCAP0\r\n\x01", "a log, or a ROS 2 bag in MCAP"),
+            (b"\x28\xb5\x2f\xfd", "compressed with zstd; of a bag give the folder with its metadata.yaml"),
+            (b"\x89MCAP0\r\n\x01", "MCAP, but no ROS 2 bag"),
             (b"LOGG\x90\0\0\0", "a BLF file of Vector"),
         ],
     )
     def test_a_container_of_another_format_is_named(self, tmp_path: Path, begins: bytes, what: str) -> None:
-        """Formats are recognised by the first bytes written by SQLite, rosbag, MCAP and python-can's BLF reader."""
+        """Formats are recognised by the first bytes written by zstd, MCAP and python-can's BLF reader."""
         (tmp_path / "flight.bag").write_bytes(begins + bytes(100))
         code, error, _ = self.run(tmp_path, str(tmp_path / "flight.bag"))
-        want = f"swath: {tmp_path}/flight.bag: is {what}; want pcap, candump -L or the bytes of a device\n"
+        want = f"swath: {tmp_path}/flight.bag: is {what}; want pcap, candump -L, a bag or the bytes of a device\n"
         assert (code, error) == (2, want)
 
     def test_a_capture_of_other_ports_is_reported(self, tmp_path: Path) -> None:
