@@ -13,7 +13,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,8 +45,8 @@ def steps(page: str) -> list[Step]:
     return found
 
 
-def run(command: str, folder: Path) -> list[str]:
-    """Run a command of the page in a folder, and return the lines that it prints; its exit code must be 0."""
+def run(command: str, folder: Path, codes: Sequence[int] = (0,)) -> list[str]:
+    """Run a command of the page in a folder, and return the lines that it prints; `codes`: expected exit codes."""
     words = [path for word in shlex.split(command) for path in (_expanded(word, folder) if "*" in word else [word])]
     if words[0] == "cp":
         shutil.copy(folder / words[1], folder / words[2])
@@ -55,7 +55,7 @@ def run(command: str, folder: Path) -> list[str]:
     program = [sys.executable, "-m", "swath.daemon.cli.main", *words[1:]]
     environment = os.environ | {"PYTHONPATH": str(ROOT), "COLUMNS": COLUMNS}
     done = subprocess.run(program, cwd=folder, env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, f"{command}: exit code {done.returncode}\n{done.stdout}{done.stderr}"
+    assert done.returncode in codes, f"{command}: exit code {done.returncode}\n{done.stdout}{done.stderr}"
     return [line.rstrip() for line in done.stdout.splitlines() if line.strip()]
 
 

@@ -26,6 +26,7 @@ def command(
         Path | None,
         typer.Option("--output", "-o", metavar="DIR", help="Folder for a page with pictures, its PDF, and a CSV."),
     ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files of an earlier run.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
     """Show the parameters of all calibrations over time, scanner by scanner, and test what has changed.
@@ -34,8 +35,12 @@ def command(
     compared with the one before; each parameter of a mounting is called constant, drifting or changed at one time.
     """
     require_installed("swath history", *(PRINTED_PAGES if output else ()))
+    from swath.daemon.processing.earlier_runs import refuse_existing
     from swath.daemon.processing.history.run import collect, history_lines
+    from swath.daemon.processing.pages.names import HISTORY, HISTORY_TABLE
 
+    if output is not None:
+        refuse_existing((output / HISTORY, output / HISTORY_TABLE), overwrite=overwrite)
     found = collect(paths)
     warnings: list[str] = []
     written: list[Path] = []

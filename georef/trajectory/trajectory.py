@@ -53,6 +53,15 @@ def gps_text(gps_ns: int) -> str:
     return f"GPS week {week}, {of_week_ns / SECOND_NS:.3f} s"
 
 
+def gps_span_text(start_ns: int, end_ns: int) -> str:
+    """Return a span of GPS time as text: ``GPS week 2445, 561618.000 to 561620.500 s``."""
+    (week, start_of_week_ns), (last, _) = week_from_gps(int(start_ns)), week_from_gps(int(end_ns))
+    if week != last:
+        return f"{gps_text(start_ns)} to {gps_text(end_ns)}"
+    end_of_week_ns = start_of_week_ns + int(end_ns) - int(start_ns)
+    return f"GPS week {week}, {start_of_week_ns / SECOND_NS:.3f} to {end_of_week_ns / SECOND_NS:.3f} s"
+
+
 @jit_inline
 def locate_epoch(time_ns: Int64Array, t: int, guess: int) -> int:
     """Return the epoch at or before t, 0 … n − 2; −1 if t lies outside.

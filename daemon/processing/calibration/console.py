@@ -40,7 +40,7 @@ def calibration_lines(
     adjusted, after = done.adjusted, strips[1]
     lines = [*_parameter_lines(report, knots), *_held_lines(adjusted, knots)]
     planes, ties = len(done.features.planes), len(done.features.ties)
-    seen = [f"{planes} planes", *([f"{ties} tie points"] if ties else [])]
+    seen = [f"{planes:,} planes", *([f"{ties:,} tie points"] if ties else [])]
     control = sum(len(plane.control) for plane in done.features.planes)
     used = f", {control} of {len(done.control)} control points" if done.control else ""
     fit = f"redundancy {adjusted.redundancy:,.0f}, variance factor {adjusted.variance_factor:.2f}"

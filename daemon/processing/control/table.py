@@ -21,6 +21,7 @@ LIMITS_DEG = {Role.LAT: 90.0, Role.LON: 360.0}
 FARTHEST_MAP = 1e8  # largest easting or northing, in any unit
 HIGHEST = 9000.0
 SMALLEST_SIGMA_M, LARGEST_SIGMA_M = 1e-6, 10.0
+_GROUPED = re.compile(r"[+-]?\d{1,3}(?:,\d{3})+\.\d+")
 _DECIMAL = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
 _ANGLE = re.compile(
     r"([NSEWO])?\s*([-+])?\s*(\d{1,3})\s*[°d:\s]\s*(\d{1,2})\s*['’′m:\s]\s*(\d{1,2}(?:\.\d*)?)\s*(?:\"|”|″|'')?"
@@ -91,8 +92,10 @@ def error_of(path: Path, lines: Sequence[str]) -> ControlError:
 
 
 def number_of(text: str) -> float:
-    """Return a number with a decimal point; apostrophes may group digits; nan if it is none."""
+    """Return a number with a decimal point; apostrophes may group digits, and commas before a point; nan if none."""
     plain = text.strip().replace("'", "").replace("’", "")
+    if _GROUPED.fullmatch(plain):
+        plain = plain.replace(",", "")
     return float(plain) if _DECIMAL.fullmatch(plain) else math.nan
 
 

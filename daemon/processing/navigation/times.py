@@ -12,7 +12,7 @@ from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
 from swath.georef.records import DEVICE_CLOCK_DTYPE
 from swath.georef.stream.clocks import HostClocks
 from swath.georef.timescales import SECOND_NS, WEEK_NS, DeviceClock
-from swath.georef.trajectory.trajectory import gps_text
+from swath.georef.trajectory.trajectory import gps_span_text
 
 GREATEST_SIGMA_NS = 1e9  # of a usable time: an offset of this size can still be found
 PAUSE_S = 0.5  # of arrivals: after it a unit without a counter is assumed to have missed samples
@@ -40,7 +40,7 @@ class Stretch:
     @property
     def text(self) -> str:
         """The stretch in words: begin, end, length and reason."""
-        return f"from {gps_text(self.begin_ns)} to {gps_text(self.end_ns)}, {self.seconds:.1f} s: {self.why}"
+        return f"{gps_span_text(self.begin_ns, self.end_ns)}, {self.seconds:.1f} s: {self.why}"
 
 
 @dataclass(frozen=True, slots=True)

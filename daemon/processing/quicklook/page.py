@@ -6,8 +6,9 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from swath.calib.labels import number
+from swath.calib.labels import length, number
 from swath.calib.strips.standards import ASPRS_OVERLAP, QUALITY_LEVELS, TO_CONFIRM, USGS
+from swath.daemon.processing.carried_verdict import points_verdicts
 from swath.daemon.processing.files import write_whole
 from swath.daemon.processing.pages.blocks import Block, Card, Cell, Image, Judged, Notes, Table, Words, data_uri
 from swath.daemon.processing.pages.head import head_of_sidecars
@@ -27,6 +28,7 @@ from swath.daemon.processing.quicklook.profile_picture import draw_profile
 from swath.daemon.processing.quicklook.run import Look
 from swath.daemon.processing.quicklook.strips import FEWEST_RETURNS, ROUGHEST_M, STEEPEST_DEG
 from swath.georef.progress import Tell, silent
+from swath.georef.verdicts import Verdict, worst_first
 
 MOST_ROWS = 300
 FEW_CELLS = 30
@@ -71,10 +73,20 @@ def page_of(look: Look, title: str, pictures: Sequence[Image]) -> str:
         title,
         head_of_sidecars((source.sidecar for source in look.sources), crs_of(source.crs for source in look.sources)),
         [*_notes(look), *pictures, *_quality(look), *_pairs(look), _strips(look), _files(look)],
+        verdict_of(look),
         cards=_cards(look),
         appendix=[*([_method(look)] if look.overlap.rows else []), *_sidecars(look)],
     )
     return html_of(page)
+
+
+def verdict_of(look: Look) -> Verdict | None:
+    """Return the verdict on what the points were made with; None if nothing is doubtful."""
+    reasons = [one.reason for one in points_verdicts([source.sidecar for source in look.sources])]
+    if not reasons:
+        return None
+    worst, ordered = worst_first(reasons)
+    return Verdict(worst, f"{worst.heading}: {'; '.join(reason.what for reason in ordered)}.", ordered)
 
 
 def _cards(look: Look) -> list[Card]:
@@ -92,7 +104,7 @@ def _cards(look: Look) -> list[Card]:
         cards.append((level, "best quality level met"))
     sigma_m = _root_mean_square(look)
     if sigma_m is not None:
-        cards.append((f"{100 * sigma_m:.1f} cm", "sigma of height"))
+        cards.append((length(sigma_m), "sigma of height"))
     return cards
 
 

@@ -32,7 +32,7 @@ from swath.daemon.processing.trajectory.pictures import (
 )
 from swath.daemon.processing.trajectory.series import Flight, course_of, determined_axes, separation_of
 from swath.daemon.processing.trajectory.verdict import Found, judge
-from swath.georef.trajectory.trajectory import gps_text
+from swath.georef.trajectory.trajectory import gps_span_text
 from swath.georef.verdicts import Level, Verdict
 
 MOST_REASONS = 40
@@ -185,7 +185,7 @@ def page_of(
 
 def _span_words(figures: Figures) -> str:
     method = "filtered, not smoothed" if figures["solution"] == "filter" else "filtered and smoothed"
-    return f"{gps_text(figures['start_gps_ns'])} to {gps_text(figures['end_gps_ns'])}, {method}"
+    return f"{gps_span_text(figures['start_gps_ns'], figures['end_gps_ns'])}, {method}"
 
 
 def _duration(seconds: float) -> str:

@@ -24,6 +24,7 @@ from swath.daemon.processing.calibration.report.profiles import (
     pictures,
     profiles_table,
 )
+from swath.daemon.processing.pages.blocks import Table
 from swath.georef.arrays import FloatArray
 from tests.calib.analytic_scene import Line, Scanner, fly, gables
 from tests.calib.roofs import exactly_known
@@ -148,7 +149,7 @@ def test_planes_and_profiles_agree_within_their_sigmas(flight: Flight, prior: Tr
 def test_profile_check_appears_in_the_report(flight: Flight, prior: TrajectoryPrior) -> None:
     checked = check(flight, known(flight), prior, CONTROL)
     compared, every = comparison_table(checked), profiles_table(checked)
-    assert compared is not None
+    assert isinstance(compared, Table)
     assert every is not None
     assert len(compared.rows) == 4
     assert len(every.rows) == len(checked.profiles)

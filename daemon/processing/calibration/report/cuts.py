@@ -23,6 +23,7 @@ HALF_LENGTH_M, HALF_WIDTH_M, MARGIN_M = 11.0, 0.6, 6.0
 LEAST_SLOPE_DEG, MOST_SLOPE_DEG = 15.0, 65.0
 MOST_DRAWN = 1500  # maximum points drawn per swath
 PANEL_IN = 1.75
+MARKS = ("o", "^", "s", "D")
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +93,7 @@ def cut_picture(report: ReportInput) -> Picture | None:
     if not cuts:
         return None
     names, colours = [swath.name for swath in report.flight.swaths], strip_colours(report.flight)
+    marks = marks_of(colours)
     swaths = sorted({index for cut in cuts for index in cut.after})
     titles = [f"{cut.name}, {word}" for cut in cuts for word in ("before", "after")]
 
@@ -103,7 +105,7 @@ def cut_picture(report: ReportInput) -> Picture | None:
         for i, cut in enumerate(cuts):
             pair = panels.axes[2 * i : 2 * i + 2]
             for axes, points in zip(pair, (cut.before, cut.after), strict=True):
-                _points(axes, points, colours)
+                _points(axes, points, colours, marks)
             every = np.concatenate([*cut.before.values(), *cut.after.values()])[:, 1]
             low, high = np.percentile(every, [0.5, 99.5])
             for axes in pair:
@@ -113,7 +115,7 @@ def cut_picture(report: ReportInput) -> Picture | None:
             axes.set_ylabel("Height (m)", fontsize=8.5, color=MUTED)
         for axes in panels.axes[-canvas.form.columns :]:
             axes.set_xlabel("Down the roof (m)", fontsize=8.5, color=MUTED)
-        look = [Line2D([], [], marker="o", ls="", ms=4, color=colours[i], label=names[i]) for i in swaths]
+        look = [Line2D([], [], marker=marks[i], ls="", ms=4, color=colours[i], label=names[i]) for i in swaths]
         canvas.legend(look, 4 if canvas.form.narrow else 10)
 
     words = (
@@ -124,11 +126,16 @@ def cut_picture(report: ReportInput) -> Picture | None:
     return Picture("Profiles", words, lambda form: top_in(form) + height(form, len(titles), PANEL_IN), draw)
 
 
-def _points(axes: Axes, points: Mapping[int, FloatArray], colours: Sequence[str]) -> None:
+def marks_of(colours: Sequence[str]) -> list[str]:
+    """Return a mark for each strip: those of one colour differ, because all strips may meet at one roof."""
+    return [MARKS[list(colours[:index]).count(colour) % len(MARKS)] for index, colour in enumerate(colours)]
+
+
+def _points(axes: Axes, points: Mapping[int, FloatArray], colours: Sequence[str], marks: Sequence[str]) -> None:
     many = sum(map(len, points.values())) > MOST_MARKS
     for index, place in points.items():
         shown = place[:: max(1, len(place) // MOST_DRAWN)]
         size = float(np.clip(60.0 / math.sqrt(max(len(shown), 1)), 1.2, 3.0))
-        (line,) = axes.plot(shown[:, 0], shown[:, 1], "o", ms=size, color=colours[index], mew=0.0, alpha=0.8)
+        (line,) = axes.plot(shown[:, 0], shown[:, 1], marks[index], ms=size, color=colours[index], mew=0.0, alpha=0.8)
         line.set_rasterized(many)
     axes.axvline(0.0, color=INK, lw=0.4, alpha=0.4)

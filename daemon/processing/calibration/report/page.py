@@ -193,9 +193,11 @@ def _observed(report: ReportInput) -> Words:
         kinds[plane.kind or "other"] = kinds.get(plane.kind or "other", 0) + 1
     patches = sum(len(plane.patches) for plane in features.planes)
     points = sum(plane.points for plane in features.planes)
-    by_kind = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items(), key=lambda item: -item[1]))
-    words = f"{len(features.planes)} planes ({by_kind}) in {patches} patches of {thousands(points)} returns"
-    return Words(words + (f"; {len(features.ties)} tie points." if features.ties else "."))
+    often = sorted(kinds.items(), key=lambda item: -item[1])
+    by_kind = ", ".join(f"{thousands(count)} {kind}" for kind, count in often)
+    words = f"{thousands(len(features.planes))} planes ({by_kind}) in {thousands(patches)} patches of "
+    ties = f"; {thousands(len(features.ties))} tie points" if features.ties else ""
+    return Words(f"{words}{thousands(points)} returns{ties}.")
 
 
 def _checked(report: ReportInput) -> list[Content]:

@@ -25,7 +25,7 @@ from swath.calib.profiles.measure import Ground
 from swath.calib.profiles.sections import Corridor, fit_pieces
 from swath.calib.profiles.stepwise import Profile, Section
 from swath.calib.summary import Profile as Picture
-from swath.daemon.processing.pages.blocks import Table
+from swath.daemon.processing.pages.blocks import Table, Words
 from swath.daemon.processing.pages.canvas import INK, MOST_MARKS, MUTED, RASTER_DPI
 
 PAGE_IN = (9.6, 4.2)
@@ -46,17 +46,20 @@ UNDER = (
 )
 
 
-def comparison_table(checked: Check) -> Table | None:
+def comparison_table(checked: Check) -> Table | Words | None:
     """Return a table of profiles' results, the adjustment's, and the difference in sigmas; also kinds without a
-    profile.
+    profile. If no kind has one, there are only words.
     """
     if not checked.comparisons and not checked.missing:
         return None
     several = len({one.scanner for one in checked.comparisons} | {scanner for scanner, _ in checked.missing}) > 1
     rows = [_compared(one, several=several) for one in checked.comparisons]
     lost = "; ".join(f"{kind} has no profiles: {why}" for (_, kind), why in checked.missing.items())
+    under = f"{UNDER} {lost[:1].upper()}{lost[1:]}{'.' if lost else ''}".strip()
+    if not rows:
+        return Words(under, TITLE)
     heads = ("parameter", "unit", "profiles", "by profiles", "sigma", "by adjustment", "sigma", "difference / sigma")
-    return Table(TITLE, heads, rows, f"{UNDER} {lost[:1].upper()}{lost[1:]}{'.' if lost else ''}".strip())
+    return Table(TITLE, heads, rows, under)
 
 
 def _compared(one: Comparison, *, several: bool) -> list[str]:

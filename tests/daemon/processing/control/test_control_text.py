@@ -33,6 +33,12 @@ def test_exports_of_programs_are_read(export: str) -> None:
     np.testing.assert_allclose(read(EXPORTS[export]), utm32(), atol=6e-5)
 
 
+def test_commas_may_group_digits_before_a_decimal_point() -> None:
+    """Spreadsheets write coordinates so, in quotes."""
+    table = read_text('Point,Easting,Northing,Height\nA,"492,798.776","5,258,682.024",469.932\n', FILE)
+    np.testing.assert_array_equal(table.plane, [[492798.776, 5258682.024]])
+
+
 def test_sigmas_are_the_largest_of_a_point_and_optional() -> None:
     table = read_text(EXPORTS["trimble-with-precisions"], FILE)
     assert table.sigma_m.tolist() == [0.015] * 3

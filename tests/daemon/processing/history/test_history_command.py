@@ -91,6 +91,11 @@ def test_page_pdf_and_csv_are_written(archive: Path, tmp_path: Path) -> None:
     assert float(rows[2]["omega_deg"]) == pytest.approx(0.28)
     assert (rows[2]["omega_deg_sigma"], rows[2]["phi_deg_sigma"]) == ("0.002", "")
     assert (output / "history.pdf").read_bytes().startswith(b"%PDF")
+    (output / "history.pdf").unlink()
+    assert run_app(["history", str(archive), "-o", str(output)]) == ExitCode.USAGE  # as everywhere
+    assert not (output / "history.pdf").exists()
+    assert run_app(["history", str(archive), "-o", str(output), "--overwrite"]) == 0
+    assert (output / "history.pdf").exists()
 
 
 def test_a_table_of_many_parameters_fits_a_sheet_and_dates_do_not_cover_each_other(archive: Path) -> None:

@@ -5,13 +5,17 @@ from __future__ import annotations
 import io
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from pypdf import PdfReader
 
 from swath import __version__
 from swath.calib.labels import worded
+from swath.calib.profiles.check import Check
+from swath.daemon.processing.calibration.report.cuts import marks_of
+from swath.daemon.processing.calibration.report.profiles import comparison_table
 from swath.daemon.processing.pages import pdf
 from swath.daemon.processing.pages.blocks import Cell, Image, Judged, Notes, Table, Words, reasons_of
 from swath.daemon.processing.pages.head import (
@@ -24,7 +28,9 @@ from swath.daemon.processing.pages.head import (
 from swath.daemon.processing.pages.names import OF_COMMAND, PRINTED
 from swath.daemon.processing.pages.pdf import PdfUnavailableError, page_files, pdf_of
 from swath.daemon.processing.pages.render import BEFORE_UNIT, Page, html_of
+from swath.daemon.processing.quicklook.page import verdict_of
 from swath.daemon.processing.quicklook.product_facts import rows_of
+from swath.georef.trajectory.trajectory import gps_span_text
 from swath.georef.verdicts import Level, Reason, Verdict
 from tests.daemon.processing.pages.builders import faults_of
 
@@ -72,6 +78,34 @@ def test_rows_of_cards_have_equal_lengths(count: int, wide: int, printed: int) -
 def test_a_nominal_calibration_is_never_called_good() -> None:
     assert calibration_words("left", {"id": "c", "method": "nominal"}, "good") == "c of left, nominal, never estimated"
     assert calibration_words("left", {"id": "c"}, "good") == "c of left, good"
+
+
+def test_a_quick_look_tells_the_verdict_on_what_the_points_were_made_with() -> None:
+    """Each strip's file has the same sidecar; the sentence tells its reason once."""
+    what = "calibration c of left is nominal: points may lie 2.5 m off; run swath calibrate"
+    entry = {"level": "not to be used", "reasons": [{"level": "not to be used", "what": what}]}
+    source = SimpleNamespace(sidecar={"format": "swath.georef", "verdict": entry})
+    verdict = verdict_of(cast(Any, SimpleNamespace(sources=[source, source])))
+    assert verdict is not None
+    assert verdict.sentence == "Not to be used: calibration c of left is nominal: points may lie 2.5 m off."
+    assert verdict_of(cast(Any, SimpleNamespace(sources=[SimpleNamespace(sidecar={})]))) is None
+
+
+def test_profiles_of_no_kind_are_words_and_no_empty_table() -> None:
+    table = comparison_table(Check((), (), {("left", "roll"): "the flight has no two lines"}))
+    assert isinstance(table, Words)
+    assert table.text.endswith("Roll has no profiles: the flight has no two lines.")
+
+
+def test_strips_of_one_colour_have_different_marks() -> None:
+    assert marks_of(["red", "blue", "red", "red"]) == ["o", "o", "^", "s"]
+
+
+def test_a_span_of_gps_time_names_its_week_once() -> None:
+    assert gps_span_text(1_465_549_218_000_000_000, 1_465_549_220_500_000_000) == (
+        "GPS week 2423, 118818.000 to 118820.500 s"
+    )
+    assert gps_span_text(604_799_000_000_000, 604_801_000_000_000) == "GPS week 0, 604799.000 s to GPS week 1, 1.000 s"
 
 
 def test_times_of_a_short_flight_have_seconds() -> None:
