@@ -11,6 +11,7 @@ signal, or is a code of J1939 for "error" or "not available"; such a temperature
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -282,6 +283,8 @@ class DbcParser(PacketParser):
             dropped |= self._unusable(signal, bits, values, dropped)
             field = "specific_force_b" if number < 3 else "angular_rate_b"
             np.multiply(values, signal.factor, out=rows[field][:, number % 3])
+        for first in range(0, len(self._map.vectors), 3):
+            dropped |= self._blank(self._map.vectors[first : first + 3], data, dropped)
         rows["temperature_c"] = np.nan
         temperature = self._map.temperature
         if temperature is not None:
@@ -293,6 +296,21 @@ class DbcParser(PacketParser):
             bits, known = self._bits_of(self._map.status, data, position)
             rows["status"] = np.where(known, bits & np.uint64(0xFFFF_FFFF), 0)
         return dropped
+
+    def _blank(self, axes: Sequence[MappedSignal], data: list[ByteRows], dropped: BoolArray) -> BoolArray:
+        """Return where all axes of an unsigned quantity are ones, its usual "not available"; count the rows that are
+        not dropped already.
+
+        A DBC that gives no range and does not say that it is J1939's leaves no other sign of it. One saturated axis, or
+        −1 in signed ones, may be measured.
+        """
+        if any(axis.layout.is_float or axis.layout.signed for axis in axes):
+            return np.zeros(len(dropped), np.bool_)
+        ones = [axis.layout.bits(data[axis.part]) == np.uint64((1 << axis.layout.length) - 1) for axis in axes]
+        blank: BoolArray = np.logical_and.reduce(ones) & ~dropped
+        if blank.any():
+            self.counters.errors["not_available"] += int(blank.sum())
+        return blank
 
     def _unusable(self, signal: MappedSignal, bits: UInt64Array, values: FloatArray, dropped: BoolArray) -> BoolArray:
         """Return which values of a signal cannot be used; count the rows that are not dropped already."""

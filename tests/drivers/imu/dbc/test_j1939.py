@@ -60,6 +60,21 @@ def test_not_available_values_of_a_recording_are_dropped_and_counted() -> None:
     assert (marked.counters.errors, marked.warnings) == ({"not_available": 50}, ())
 
 
+def test_a_sample_of_ones_is_not_available_where_the_dbc_says_nothing() -> None:
+    """Three unsigned axes at their top count are no measurement; one at its top, or −1 in signed ones, may be one."""
+    text = (CASES / "j1939-not-available/imu.dbc").read_text()
+    text = text.replace("[-320|322.55]", "[0|0]").replace("[-250|250]", "[0|0]")
+    units = frames_of("j1939-not-available")
+    one = encode_can_frame(0x08F02D80, struct.pack("<4H", 0xFFFF, 32000, 32000, 0), extended=True)
+    other = encode_can_frame(0x0CF02A80, struct.pack("<4H", *[32000] * 4), extended=True)
+    units += [(units[-1][0] + 10_000_000, other), (units[-1][0] + 10_300_000, one)]
+    for dbc, samples, errors in ((text, 251, {"not_available": 50}), (text.replace("@1+", "@1-"), 301, {})):
+        parser = DbcParser(DeviceSettings("imu/main", {"dbc": "a.dbc", "signals": SIGNALS}, {"dbc": dbc.encode()}))
+        rows = imu_rows(parse(parser, units))
+        assert (len(rows), parser.counters.errors, parser.warnings) == (samples, errors, ())
+    assert rows["specific_force_b"][:, 0].min() == pytest.approx(-320.01)  # minus one count
+
+
 def test_a_message_of_j1939_is_found_by_its_pgn_whatever_its_source_address() -> None:
     parser = DbcParser(case_settings("j1939-source-address"))
     rows = imu_rows(parse(parser, frames_of("j1939-source-address")))
