@@ -10,8 +10,8 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from socket import AF_INET, SOCK_DGRAM, socket
 
@@ -295,9 +295,8 @@ class TestOtherProtocols:
             report = check(text + identity, tmp_path, 0.5)["scanner/left"]
         assert report.problems == ["sends srep, but velodyne-vlp16 is configured"]
 
-    @pytest.mark.parametrize(
-        ("configured", "recording", "answers_as"),
-        [
+    def test_real_recordings_of_other_receivers_are_named(self, tmp_path: Path) -> None:
+        told = (
             ("nmea", "novatel/propak6-basic-fix.gps.gz", "novatel"),
             ("nmea", "ubx/ublox-zed-f9p-hp.log.gz", "ubx"),
             ("novatel", "ubx/ublox-zed-f9p-hp.log.gz", "ubx"),
@@ -312,16 +311,21 @@ class TestOtherProtocols:
             ("novatel", "unicore/um982_n4.bin", "unicore"),
             ("nmea", "gsof/bx992.bin", "gsof"),
             ("ubx", "applanix/pos_lv.bin", "applanix-pos"),
-        ],
-    )
-    def test_a_real_recording_of_another_receiver_is_named(
-        self, configured: str, recording: str, answers_as: str, tmp_path: Path
-    ) -> None:
-        content = (ROOT / "fixtures" / recording).read_bytes()
-        data = gzip.decompress(content) if recording.endswith(".gz") else content
-        with pty(lambda number: data[number * 2000 % len(data) :][:2000]) as path:
-            report = check(gnss(path, configured), tmp_path)["gnss/rover"]
-        assert report.problems == [f"sends {answers_as}, but {configured} is configured"]
+        )
+
+        def part_of(recording: str) -> Callable[[int], bytes]:
+            content = (ROOT / "fixtures" / recording).read_bytes()
+            data = gzip.decompress(content) if recording.endswith(".gz") else content
+            return lambda number: data[number * 2000 % len(data) :][:2000]
+
+        text, wanted = "", {}
+        with ExitStack() as ports:
+            for number, (configured, recording, answers_as) in enumerate(told):
+                path = ports.enter_context(pty(part_of(recording)))
+                text += gnss(path, configured).replace("[gnss.rover]", f"[gnss.r{number}]")
+                wanted[f"gnss/r{number}"] = [f"sends {answers_as}, but {configured} is configured"]
+            reports = check(text, tmp_path)
+        assert {source: reports[source].problems for source in wanted} == wanted
 
     def test_a_real_recording_of_another_scanner_is_named(self, tmp_path: Path) -> None:
         """A VLP-16 sends where a line scanner is configured."""
@@ -373,35 +377,38 @@ class TestOtherProtocols:
         entry = DeviceEntry("scanner", "left", spec, None, "robosense-rs16", None, DeviceSettings("scanner/left"), {})
         assert identify(entry, kept, than=0) == "robosense-helios16p or robosense-helios32"
 
-    @pytest.mark.parametrize(
-        ("recording", "answers_as"),
-        [
+    def test_heads_of_other_models_are_named_despite_an_identical_second_port(self, tmp_path: Path) -> None:
+        """Velodyne's position packets are the same for all models, but the data packets are another model's."""
+        models = (
             ("velodyne/nebula_vlp32.pcap.gz", "velodyne-vlp32c"),
             ("hesai/nebula_xt32.pcap.gz", "hesai-xt32"),
             ("hesai/nebula_qt64.pcap.gz", "hesai-qt64"),
             ("hesai/nebula_xt16.pcap.gz", "hesai-xt16"),
             ("hesai/nebula_xt32m.pcap.gz", "hesai-xt32m2x"),
             ("hesai/nebula_qt128.pcap.gz", "hesai-qt128"),
-        ],
-    )
-    def test_a_head_of_another_model_is_named_despite_an_identical_second_port(
-        self, recording: str, answers_as: str, tmp_path: Path
-    ) -> None:
-        """Velodyne's position packets are the same for all models, but the data packets are another model's."""
-        data, position = free_udp_port(), free_udp_port()
-        recorded = [unit.data for unit in read_pcap(ROOT / "fixtures" / recording)]
-        text = (
-            f'[scanner.roof]\ntransport = "udp:127.0.0.1:{data}?buffer_mb=1"\nprotocol = "velodyne-vlp16"\n'
-            f'auxiliary = "udp:127.0.0.1:{position}?buffer_mb=1"\n'
-            "installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
         )
         packets = [unit.data for unit in read_pcap(ROOT / "fixtures/velodyne/mrpt_vlp16_gps.pcap.gz", port=8308)]
-        with (
-            udp_sender(data, lambda number: recorded[number % len(recorded)]),
-            udp_sender(position, lambda number: packets[number % len(packets)] if number % 9 == 0 else b""),
-        ):
-            report = check(text, tmp_path, 0.5)["scanner/roof"]
-        assert report.problems == [f"sends {answers_as}, but velodyne-vlp16 is configured"]
+
+        def turns_of(recording: str) -> Callable[[int], bytes]:
+            recorded = [unit.data for unit in read_pcap(ROOT / "fixtures" / recording)]
+            return lambda number: recorded[number % len(recorded)]
+
+        text, wanted = "", {}
+        with ExitStack() as ports:
+            for recording, answers_as in models:
+                data, position = free_udp_port(), free_udp_port()
+                text += (
+                    f'[scanner.{answers_as}]\ntransport = "udp:127.0.0.1:{data}?buffer_mb=1"\n'
+                    f'protocol = "velodyne-vlp16"\nauxiliary = "udp:127.0.0.1:{position}?buffer_mb=1"\n'
+                    "installation = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]\n"
+                )
+                wanted[f"scanner/{answers_as}"] = [f"sends {answers_as}, but velodyne-vlp16 is configured"]
+                ports.enter_context(udp_sender(data, turns_of(recording)))
+                ports.enter_context(
+                    udp_sender(position, lambda number: packets[number % len(packets)] if number % 9 == 0 else b"")
+                )
+            reports = check(text, tmp_path, 0.5)
+        assert {source: reports[source].problems for source in wanted} == wanted
 
     def test_garbage_matches_no_protocol_and_suggests_the_baud_rate(self, tmp_path: Path) -> None:
         noise = np.random.default_rng(7).integers(128, 255, 4000, dtype=np.uint8).tobytes()
