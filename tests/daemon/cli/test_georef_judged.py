@@ -63,10 +63,10 @@ class Judged:
         crs = () if "--crs" in more else ("--crs", "EPSG:32632")
         return ["georef", str(self.flown.log), "-o", str(output), *crs, *self.given(trajectory), "--no-sigma", *more]
 
-    def navigated(self, output: Path, *more: str) -> list[str]:
+    def navigated(self, output: Path) -> list[str]:
         """Return the arguments of a command that navigates the log with the lever arm of opposite sign."""
         config = self.flown.changed("mirrored.toml", **{ARM: MIRRORED}).path
-        more = ("--config", str(config), "--crs", "EPSG:32632", "--workers", "1", "--no-sigma", *more)
+        more = ("--config", str(config), "--crs", "EPSG:32632", "--workers", "1", "--no-sigma")
         return ["georef", str(self.flown.log), "-o", str(output), *self.calibration, *more]
 
     @property
@@ -124,9 +124,9 @@ def test_unusable_points_are_accepted_with_the_users_override(
     judged: Judged, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capsys.readouterr()
-    assert run_app(judged.navigated(tmp_path, "--accept-verdict")) == 0
+    assert run_app(judged.georef(tmp_path, "--accept-verdict", trajectory="judged")) == 0
     said = capsys.readouterr()
-    assert said.out.startswith("not to be used: navigated trajectory of ")
+    assert said.out.startswith(f"not to be used: trajectory {judged.trajectory('judged')}: {SIGN}")
     assert "not to be used" not in said.err
     assert sidecar(tmp_path)["verdict"]["accepted"]
 
