@@ -407,7 +407,7 @@ class TestOtherProtocols:
                 ports.enter_context(
                     udp_sender(position, lambda number: packets[number % len(packets)] if number % 9 == 0 else b"")
                 )
-            reports = check(text, tmp_path, 0.5)
+            reports = check(text, tmp_path)
         assert {source: reports[source].problems for source in wanted} == wanted
 
     def test_garbage_matches_no_protocol_and_suggests_the_baud_rate(self, tmp_path: Path) -> None:
