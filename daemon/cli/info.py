@@ -194,5 +194,5 @@ def _decoded(decoded: dict[str, Any]) -> str:
     for key, words in (("bad_checksums", "bad checksums"), ("bad_messages", "bad messages")):
         if decoded[key]:
             parts.append(f"{decoded[key]} {words}")
-    parts += [f"{count} × {code}" for code, count in decoded["errors"].items()]
+    parts += [f"{count} × {code}" for code, count in decoded["errors"].items() if count]
     return ", ".join(parts) or "nothing decoded"

@@ -189,7 +189,7 @@ def _decoded(decoded: dict[str, Any] | None) -> str | None:
     parts = [f"{rate:,.1f} {name}/s" for name, rate in decoded["records_hz"].items()]
     if decoded["bad"]:
         parts.append(f"{decoded['bad']} messages damaged")
-    parts += [f"{count} × {code}" for code, count in decoded["errors"].items()]
+    parts += [f"{count} × {code}" for code, count in decoded["errors"].items() if count]
     text = ", ".join(parts) or "nothing decoded"
     share = decoded["share"]
     return text if share == 1.0 else f"{text} (of {share:.0%} of the seconds)"

@@ -134,6 +134,9 @@ def test_long_names_and_wide_sigmas_fit_and_unknown_values_are_omitted(
     source |= {"lost": lost, "account_errors": 0, "time_state": "HOLDOVER", "time_sigma_ns": 57_712.3}
     source |= {"has_status": has_status}
     source |= {"trouble": {"bus_off": 2, "error_frames": 1_500}}
+    counted = {"records": {}, "messages": {}, "bad_checksums": 0, "bad_messages": 0}
+    source["decoded"] = {**counted, "errors": {"error_frame": 1, "rtr_frame": 0}}
+    source["mixed_senders"] = {"192.168.1.201": 2, "192.168.1.202": 3}
     numbers: dict[str, object] = {
         "missing_parts": [],
         "last_events": [],
@@ -155,6 +158,8 @@ def test_long_names_and_wide_sigmas_fit_and_unknown_values_are_omitted(
     assert "every unit is accounted for" not in page.getvalue().removeprefix(text)
     assert "…" not in text
     assert "57.7µs" in text
+    assert "scanner/left-front/aux: 1 × error_frame\n" in text
+    assert "2 devices send to its port" in text
     assert "  ? mark: [x]\n" in text
     assert "scanner/left-front/aux: 2 bus off, 1,500 error frames" in text
 
