@@ -31,7 +31,7 @@ _LABELS: dict[str, tuple[str, str]] = {  # words, symbol
 _UNITS = {"deg": "°", "m": "m", "ppm": "ppm", "us": "µs", "us2": "µs²"}
 _BY_NAME = {parameter.name: parameter for parameter in PARAMETERS}
 _BY_KEY = {parameter.key: parameter.name for parameter in PARAMETERS}
-_KEYS = re.compile(rf"\b(?:{'|'.join(sorted(_BY_KEY, key=len, reverse=True))})\b")
+_KEYS = re.compile(rf"\b({'|'.join(sorted(_BY_KEY, key=len, reverse=True))})\b(?:( [+−-][\d.,]+ ± [\d.,]+)(?![\d.]))?")
 _NAMED = re.compile(rf"\b([\w-]+)\.({'|'.join(sorted(_LABELS, key=len, reverse=True))})\b")
 _SUFFIXES = (("_rad", "°", 180.0 / math.pi), ("_m", "m", 1.0), ("_s", "µs", 1e6))
 
@@ -87,8 +87,13 @@ def plain(text: str, *, several: bool) -> str:
 
 
 def worded(text: str) -> str:
-    """Replace the keys of parameters in a sentence, such as ``omega_deg``, by their words."""
-    return _KEYS.sub(lambda found: _LABELS[_BY_KEY[found[0]]][0], text)
+    """Replace the keys of parameters in a sentence, such as ``omega_deg``, by their words; values get their units."""
+
+    def words(found: re.Match[str]) -> str:
+        one = unknown(f".{_BY_KEY[found[1]]}")
+        return one.words + (f"{found[2]}{'' if one.unit == '°' else ' '}{one.unit}" if found[2] else "")
+
+    return _KEYS.sub(words, text)
 
 
 def is_undetermined(held: FixedParameter) -> bool:

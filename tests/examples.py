@@ -79,6 +79,7 @@ VALUES = {  # true value, sigma, change by a knock before the third, and by the 
     "range_offset_m": (0.35, 0.012, 0.0, 0.0),
     "scan_plane_tilt_deg": (0.0, 0.006, 0.0, 0.0),
 }
+LEVER_ARM = "lever_arm_x_m = 0.12\nlever_arm_y_m = -0.03\nlever_arm_z_m = 0.28\n"
 
 
 def write_calibrations(folder: Path, *, knocked: bool) -> None:
@@ -100,7 +101,9 @@ def write_calibrations(folder: Path, *, knocked: bool) -> None:
         }
         parameters = "".join(f"{key} = {value:.6f}\n" for key, value in found.items())
         sigmas = "".join(f"{key} = {sigma}\n" for key, (_, sigma, *_) in VALUES.items())
-        (folder / f"{flown:%Y-%m-%d}.toml").write_text(f"{head}\n[parameters]\n{parameters}\n[sigma]\n{sigmas}")
+        (folder / f"{flown:%Y-%m-%d}.toml").write_text(
+            f"{head}\n[parameters]\n{parameters}{LEVER_ARM}\n[sigma]\n{sigmas}"
+        )
 
 
 def small(pdf: bytes) -> bytes:

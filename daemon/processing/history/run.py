@@ -31,6 +31,9 @@ OF_RECORD = {  # attributes of a record with values and sigmas, and the paramete
     "scannerAssembly": ("scan_plane_tilt_rad",),
 }
 
+REMEDY = "give folders with files of swath calibrate"
+MOST_NOTES = 5  # that are told where there is no calibration
+
 
 @dataclass(frozen=True, eq=False)
 class Collected:
@@ -68,7 +71,7 @@ def collect(paths: Sequence[Path]) -> Collected:
             notes.append(f"{path}: has the id of {files[one.id]}, {one.id}, but other values; it was left out")
     if not found:
         where = ", ".join(map(str, paths))
-        raise UserError(f"{where}: no calibration there; give folders with files of swath calibrate")
+        raise UserError("\n".join([*notes[:MOST_NOTES], f"{where}: no calibration there; {REMEDY}"]))
     try:
         scanners = courses(list(found.values()))
     except HistoryError as error:
@@ -92,7 +95,7 @@ def _calibrations(paths: Sequence[Path], notes: list[str]) -> Iterator[tuple[Pat
         except CalibrationError as error:
             if path in paths:
                 raise UserError(str(error), ExitCode.USAGE) from error
-            notes.append(f"{error}; it was left out")
+            notes.append(f"{str(error).splitlines()[0]}; it was left out")
 
 
 def _of_records(paths: Sequence[Path], notes: list[str]) -> Iterator[tuple[Path, Calibration]]:

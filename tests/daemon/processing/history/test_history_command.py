@@ -78,6 +78,18 @@ def test_the_console_shows_table_changes_and_courses(archive: Path, capsys: pyte
     assert any(line.startswith("HB-ABC/left/2026-01: range offset: constant, 0.3500 ± 0.0046 m") for line in lines)
 
 
+def test_files_that_are_left_out_are_named_where_there_is_no_calibration(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "left.toml").write_text("[calibration]\nid = 1\n[parameters]\n")
+    assert run_app(["history", str(tmp_path)]) == ExitCode.PROBLEM
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == 2
+    assert told[0].startswith(f"swath: {tmp_path}/left.toml: ")
+    assert told[0].endswith("; it was left out")
+    assert told[1].endswith("no calibration there; give folders with files of swath calibrate")
+
+
 def test_page_pdf_and_csv_are_written(archive: Path, tmp_path: Path) -> None:
     output = tmp_path / "out"
     assert run_app(["history", str(archive), "-o", str(output)]) == 0

@@ -67,6 +67,9 @@ def test_a_page_names_parameters_by_words() -> None:
     assert isinstance(table, Table)
     assert table.rows == [["add −273 ± 61 µs to time offset", "calibrate"]]
     assert worded("scan_angle_scale_ppm, scan_angle_offset_deg") == "scan angle scale, scan angle offset"
+    assert worded("changed: omega_deg −0.2181 ± 0.0057 (38.6 σ), torsion_us2 +4 ± 1") == (
+        "changed: boresight ω (roll) −0.2181 ± 0.0057° (38.6 σ), torsion +4 ± 1 µs²"
+    )
 
 
 @pytest.mark.parametrize(("count", "wide", "printed"), [(4, 7, 5), (6, 7, 3), (7, 7, 4), (8, 4, 4), (9, 5, 5)])
