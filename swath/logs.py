@@ -27,7 +27,7 @@ from swath.drivers.parser import DriverSettingsError
 from swath.drivers.transports.base import TransportError
 from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.records import Record
-from swath.georef.timescales import gps_ns_from_unix, table_leap_seconds
+from swath.georef.timescales.gps_time import gps_ns_from_datetime
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,7 +40,6 @@ __all__ = ["Capture", "Log", "Source", "gps_ns", "open", "read_pcap"]
 
 Time = int | dt.datetime | None
 _USUAL = {"gnss": "fixes", "imu": "samples", "scanner": "returns"}
-_EPOCH = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
 _Read = TypeVar("_Read")
 
 
@@ -54,10 +53,7 @@ def gps_ns(time: int | dt.datetime) -> int:
         return time
     if time.tzinfo is None:
         raise UserError(f"{time}: has no time zone; add tzinfo=datetime.UTC, or give GPS nanoseconds")
-    utc = time.astimezone(dt.UTC)
-    since = utc - _EPOCH
-    unix_ns = (since.days * 86_400 + since.seconds) * 1_000_000_000 + since.microseconds * 1000
-    return gps_ns_from_unix(unix_ns, table_leap_seconds(utc.date())[0])
+    return gps_ns_from_datetime(time)
 
 
 def open(*paths: Path | str, config: Path | str | None = None) -> Log:

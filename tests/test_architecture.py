@@ -46,6 +46,7 @@ IMPORTED_LATE = {
     "swath.daemon.processing.control.layers": {"shapefile"},  # for shapefiles only
     "swath.daemon.processing.flights.trajectory_choice": {"swath.georef.trajectory.turn_rates"},  # scipy.signal
     "swath.daemon.processing.pages.pdf": {"weasyprint"},
+    "swath.daemon.processing.records.files": {"pyarrow"},
     "swath.daemon.processing.setup.terrain": {"rasterio"},
     # matplotlib
     "swath.daemon.processing.trajectory.summary": {

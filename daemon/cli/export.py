@@ -16,7 +16,9 @@ from swath.georef.progress import BYTES, Tell
 if TYPE_CHECKING:
     from swath.daemon.exchange.export import ExportReport
     from swath.daemon.log.reader import Session
+    from swath.daemon.processing.records.files import RecordFiles
 
+LEAST_OF_RECORDS, MOST_OF_RECORDS = 0.1, 8.0  # the same of records: a slice as Parquet, and all as text
 LEAST_OF_LOG, MOST_OF_LOG = 0.7, 3.0  # size of exported files by that of the log, whose chunks are compressed
 
 
@@ -25,14 +27,34 @@ def command(
     directory: Annotated[
         Path, typer.Argument(help="Destination; each session gets its own folder in it.", metavar="DIR")
     ],
+    records: Annotated[
+        str | None,
+        typer.Option(metavar="FORMAT", help="Write decoded records with GPS time instead: csv, parquet or npz."),
+    ] = None,
+    source: Annotated[
+        list[str] | None,
+        typer.Option(metavar="KIND/NAME", help="With --records: only this source; repeatable."),
+    ] = None,
+    begin: Annotated[
+        str | None, typer.Option("--from", metavar="TIME", help="With --records: from this time, UTC or GPS ns.")
+    ] = None,
+    end: Annotated[
+        str | None, typer.Option("--to", metavar="TIME", help="With --records: up to this time, UTC or GPS ns.")
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace earlier exports of the logs.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
     """Write logs as serial streams (with RTKLIB's time tags), candump logs, pcap files and PPS text.
 
     What these formats cannot hold goes into a small file beside each; with it `swath import` makes the same log again.
-        Exit code 4 when the log is damaged; everything readable is still written.
+    With --records, the fixes, samples, returns and other records that the drivers decode, as tables. Exit code 4 when
+    the log is damaged; everything readable is still written.
     """
+    if records is not None:
+        _export_records(logs, directory, records, source or [], (begin, end), overwrite=overwrite, as_json=as_json)
+        return
+    if source or begin or end:
+        raise UserError("--source, --from and --to need --records", ExitCode.USAGE)
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.exchange.export import export_session
     from swath.daemon.free_space import check_space
@@ -66,6 +88,87 @@ def command(
         raise UserError("\n".join(map(one_line, lines)), ExitCode.DAMAGE)
     if any(session.missing_parts for session, _ in done):
         raise typer.Exit(int(ExitCode.PROBLEM))
+
+
+def _export_records(
+    logs: list[Path],
+    directory: Path,
+    form: str,
+    sources: list[str],
+    times: tuple[str | None, str | None],
+    *,
+    overwrite: bool,
+    as_json: bool,
+) -> None:
+    from swath.daemon.processing.requirements import require_installed
+
+    require_installed("swath export --records")
+    from swath.daemon.cli.progress import progress_bar
+    from swath.daemon.free_space import check_space
+    from swath.daemon.log.reader import open_logs
+    from swath.daemon.processing.records.files import FORMATS, arrow, write_records
+    from swath.daemon.processing.records.read import LogRecords
+    from swath.daemon.processing.user_errors import as_user_error
+
+    if form not in FORMATS:
+        raise UserError(f'--records: got "{form}", want {", ".join(FORMATS)}', ExitCode.USAGE)
+    if form != "npz":
+        arrow()
+    start_ns, stop_ns = (None if time is None else _gps_ns(time) for time in times)
+    passed_over: list[str] = []
+    done = []
+    with as_user_error(directory), progress_bar(compiling=True) as tell:
+        sessions = open_logs(logs, passed_over)
+        size = sum(part.path.stat().st_size for session in sessions for part in session.parts)
+        check_space(directory, "records", least_bytes=LEAST_OF_RECORDS * size, most_bytes=MOST_OF_RECORDS * size)
+        for session in sessions:
+            read = LogRecords.of_session(session)
+            written = write_records(
+                read,
+                directory,
+                form,
+                sources=sources,
+                start_ns=start_ns,
+                stop_ns=stop_ns,
+                overwrite=overwrite,
+                tell=tell,
+            )
+            done.append((written, read.damage))
+    if as_json:
+        plain = [{"folder": str(one.folder), "rows": one.rows, "notes": one.notes} for one, _ in done]
+        print(json.dumps({"sessions": plain, "passed_over": passed_over}, indent=2))
+    else:
+        for written, _ in done:
+            _print_records(written)
+    lines = [f"passed over: {line}" for line in passed_over]
+    lines += [f"{one.path} at byte {one.damage.offset}: {one.damage.what}" for _, damage in done for one in damage[:5]]
+    if lines:
+        raise UserError("\n".join(map(one_line, lines)), ExitCode.DAMAGE)
+
+
+def _print_records(written: RecordFiles) -> None:
+    print(one_line(str(written.folder)))
+    for name, count in written.rows.items():
+        print(f"  {name}: {count:,} rows")
+    for note in written.notes:
+        print(one_line(f"  note: {note}"))
+
+
+def _gps_ns(text: str) -> int:
+    """Return GPS ns of a time as the command line gives it."""
+    import datetime as dt
+
+    from swath.georef.timescales.gps_time import gps_ns_from_datetime
+
+    if text.isdecimal():
+        return int(text)
+    try:
+        moment = dt.datetime.fromisoformat(text)
+    except ValueError:
+        raise UserError(
+            f'got "{text}", want a time in UTC as 2026-06-15T09:00:05.5, or GPS nanoseconds', ExitCode.USAGE
+        ) from None
+    return gps_ns_from_datetime(moment.replace(tzinfo=dt.UTC) if moment.tzinfo is None else moment)
 
 
 def _tell(tell: Tell, name: str, done: int, total: int) -> None:

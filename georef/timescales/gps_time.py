@@ -73,6 +73,14 @@ def gps_ns_from_unix(unix_ns: int, leap_seconds: int) -> int:
     return unix_ns - GPS_EPOCH_UNIX_S * SECOND_NS + leap_seconds * SECOND_NS
 
 
+def gps_ns_from_datetime(moment: dt.datetime) -> int:
+    """Return GPS ns of a moment with a time zone, to a microsecond, by the built-in table of leap seconds."""
+    utc = moment.astimezone(dt.UTC)
+    since = utc - dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
+    unix_ns = (since.days * 86_400 + since.seconds) * SECOND_NS + since.microseconds * 1000
+    return gps_ns_from_unix(unix_ns, table_leap_seconds(utc.date())[0])
+
+
 def unix_ns_from_gps(gps_ns: int, leap_seconds: int) -> int:
     """Return POSIX ns of a GPS time."""
     return gps_ns + GPS_EPOCH_UNIX_S * SECOND_NS - leap_seconds * SECOND_NS

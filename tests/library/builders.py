@@ -14,7 +14,11 @@ _BLOCK = re.compile(r"^```python( norun)?\n(.*?)^```$", re.MULTILINE | re.DOTALL
 
 def fly(folder: Path, seconds: float = math.inf) -> Flown:
     """Fly two lines with a receiver, an IMU and a scanner; the receiver has two antennas and stamps marks."""
-    return fly_short(folder, two_lines("library", half_m=250.0, gnss="ins = true", prf_hz=1000), seconds)
+    return fly_short(
+        folder,
+        two_lines("library", half_m=250.0, gnss="ins = true\nsecondary_lever_arm_m = [0.1, 1.15, -1.2]", prf_hz=1000),
+        seconds,
+    )
 
 
 def examples(page: str) -> list[tuple[str, bool]]:

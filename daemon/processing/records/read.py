@@ -7,7 +7,7 @@ the slice and a margin around it, with a sigma that says how well.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -207,15 +207,22 @@ class LogRecords:
         if kind.record is ScannerReturns:
             pieces = list(self.returns(source, start_ns, stop_ns))
             return np.concatenate(pieces) if pieces else np.empty(0, kind.dtype)
+        return self.tables(source, [name], start_ns, stop_ns)[name]
+
+    def tables(
+        self, source: str, names: Iterable[str], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> dict[str, StructArray]:
+        """Return tables of a source's records of several kinds, returns excepted, in one reading; see `table`."""
+        kinds = [KINDS[name] for name in names]
         begin, end = self.host_span(start_ns, stop_ns)
-        margin = IMU_MARGIN_NS if kind.record is ImuSamples else MARGIN_NS
-        wanted = [
-            record
-            for records in self.records(source, (begin - margin, end + margin))
-            for record in records
-            if isinstance(record, kind.record)
-        ]
-        return _within(self._placed(source, kind, wanted), start_ns, stop_ns)
+        margin = IMU_MARGIN_NS if any(kind.record is ImuSamples for kind in kinds) else MARGIN_NS
+        found: dict[type, list[Any]] = {kind.record: [] for kind in kinds}
+        for records in self.records(source, (begin - margin, end + margin)):
+            for record in records:
+                if type(record) in found:
+                    found[type(record)].append(record)
+        placed = {kind.name: self._placed(source, kind, found[kind.record]) for kind in kinds}
+        return {name: _within(table, start_ns, stop_ns) for name, table in placed.items()}
 
     def _placed(self, source: str, kind: RecordKind, records: list[Any]) -> StructArray:
         """Return a table of records with their GPS times."""
