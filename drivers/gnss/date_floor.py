@@ -21,6 +21,7 @@ ROLLOVER_DAYS = 7 * ROLLOVER_WEEKS
 HOST_DAY_TOLERANCE = 1  # a host's clock may keep local time
 DAY_NS = 86_400_000_000_000
 WEEK_MS = 604_800_000
+GREATEST_WEEK = 8191  # 13 bits in the modern navigation message, to the year 2137
 GREATEST_LEAP_S = 60  # largest GPS − UTC that a message's own two times may imply; more is another error
 
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from swath.drivers.gnss.date_floor import read_date_floor, week_of
+from swath.drivers.gnss.date_floor import GREATEST_WEEK, read_date_floor, week_of
 from swath.drivers.parser import DeviceSettings, ParserCounters
 from swath.georef.records import NamesEdge, TimeMessage, TimeScale, TimeTag
 from swath.georef.timescales.gps_time import SECOND_NS
 
 WEEK_NS = 604_800 * SECOND_NS
-GREATEST_WEEK = 8191  # 13 bits in the modern navigation message, to the year 2137
 LATEST_IN_SECOND_NS = SECOND_NS // 2  # a message later in its second may arrive in the next one
 
 

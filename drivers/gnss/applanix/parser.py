@@ -43,7 +43,7 @@ from swath.drivers.gnss.applanix.solution import (
     navigation_row,
     sigmas_of,
 )
-from swath.drivers.gnss.date_floor import WEEK_MS, ReceiverDates
+from swath.drivers.gnss.date_floor import GREATEST_WEEK, WEEK_MS, ReceiverDates
 from swath.drivers.parser import DeviceSettings, DriverSettingsError
 from swath.drivers.record_rows import Row
 from swath.georef.records import (
@@ -86,8 +86,11 @@ class _Parser(FramedParser):
         """Decode one frame."""
 
     def _week(self, week: int, host_time_ns: int) -> int | None:
-        """Return a week after the move by roll-overs; None, counted, before the floor."""
+        """Return a week after the move by roll-overs; None, counted, before the floor or where no week can be."""
         week = self._dates.week(week, host_time_ns)
+        if week > GREATEST_WEEK:
+            self.counters.errors["bad_time"] += 1
+            return None
         if week < self._dates.floor_week:
             self.counters.errors["date_before_floor"] += 1
             return None

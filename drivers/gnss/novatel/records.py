@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from swath.drivers.gnss.date_floor import ReceiverDates, leap_seconds_of
+from swath.drivers.gnss.date_floor import GREATEST_WEEK, ReceiverDates, leap_seconds_of
 from swath.drivers.gnss.novatel import layouts as nov
 from swath.drivers.gnss.novatel import tables
 from swath.drivers.parser import ParserCounters
@@ -32,7 +32,6 @@ from swath.georef.records import (
 from swath.georef.timescales.gps_time import MILLISECOND_NS, SECOND_NS
 
 WEEK_NS = 604_800 * SECOND_NS
-GREATEST_WEEK = 8191  # 13 bits in the modern navigation message, to the year 2137
 GREATEST_PPS_ERROR_S = 1e-3  # a clock offset beyond this is not the offset of a steered PPS
 GREATEST_LEAP_S = 255  # the navigation message has 8 bits
 IMU_ERROR_BIT, IMU_ENCRYPTED_BIT = 1, 2  # bits of RAWIMUX's IMU info

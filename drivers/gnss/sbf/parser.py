@@ -24,7 +24,7 @@ from swath.drivers.driver import STREAM_TRANSPORTS, Driver
 from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import NMEA, RTCM3, SBF
 from swath.drivers.framing.parser import FramedParser
-from swath.drivers.gnss.date_floor import ReceiverDates, leap_seconds_of
+from swath.drivers.gnss.date_floor import GREATEST_WEEK, ReceiverDates, leap_seconds_of
 from swath.drivers.gnss.epochs import EpochGatherer
 from swath.drivers.gnss.sbf import blocks as sbf
 from swath.drivers.gnss.sbf import frame as wire
@@ -48,7 +48,6 @@ from swath.georef.timescales.gps_time import SECOND_NS
 Items: TypeAlias = list[Record | Row]
 
 FRAME_KINDS = (replace(SBF, message_name=wire.name_of), NMEA, RTCM3)
-GREATEST_WEEK = 8191  # 13 bits in the modern navigation message, to the year 2137
 GREATEST_OFFSET_NS = 1e6  # largest offset of a pulse that rounding to the receiver's clock can cause
 PULSE_SCALES = frozenset(
     (sbf.SCALE_GPS, sbf.SCALE_UTC, sbf.SCALE_GLONASS, sbf.SCALE_GALILEO, sbf.SCALE_BEIDOU)

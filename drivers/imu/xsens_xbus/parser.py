@@ -26,7 +26,7 @@ from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside
 from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import XBUS, XBUS_EXTENDED, XBUS_MTDATA2
 from swath.drivers.framing.parser import FramedParser
-from swath.drivers.gnss.date_floor import WEEK_MS, read_date_floor
+from swath.drivers.gnss.date_floor import GREATEST_WEEK, WEEK_MS
 from swath.drivers.imu.counters import CounterUnwrapper, GapCounter, nanoseconds
 from swath.drivers.imu.unit_time import LATEST_IN_SECOND_NS, WEEK_NS, Moment, UnitTime
 from swath.drivers.imu.xsens_xbus import receiver, wire
@@ -92,7 +92,6 @@ class XbusParser(FramedParser):
             raise DriverSettingsError('rate_hz: needed with sample = "increment", to divide by the interval')
         self._gaps = GapCounter(COUNTER_BITS)
         self._unwrapper = CounterUnwrapper(TICK_BITS, TICK_HZ)
-        self._floor = read_date_floor(settings)
         self._time = UnitTime(settings, self.counters, "GnssPvtData")
         self._last_second: tuple[int, ...] | None = None  # of an UtcTime, which named it
         self._leap_seconds: int | None = None
@@ -200,12 +199,16 @@ class XbusParser(FramedParser):
         if utc is None or not known or self._leap_seconds is None:
             self.counters.errors["time_unknown"] += 1
             return []
-        if utc[0] < self._floor:
-            self.counters.errors["date_before_floor"] += 1
+        gps_ns = gps_ns_from_utc(*utc, self._leap_seconds)
+        week, tow_ns = divmod(gps_ns, WEEK_NS)
+        if week > GREATEST_WEEK:
+            self.counters.count_bad("bad_value")
+            return []
+        if self._time.moment(week, tow_ns, valid=True) is None:  # before the floor, which it counts
             return []
         (status,) = items.get(wire.STATUS_WORD) or items[wire.STATUS_BYTE]
         axes = {kind: form & wire.AXES_BITS for kind, form in frames.items()}
-        row = receiver.solution_row(host_time_ns, gps_ns_from_utc(*utc, self._leap_seconds), items, axes, status)
+        row = receiver.solution_row(host_time_ns, gps_ns, items, axes, status)
         if row is None:
             self.counters.count_bad("bad_value")
             return []

@@ -260,6 +260,7 @@ def test_a_solution_needs_the_units_word_its_time_and_possible_numbers() -> None
         ({str(xbus.STATUS_WORD): [GOOD & ~xbus.FILTER_MODE]}, "ins_no_solution"),
         ({str(xbus.UTC_TIME): (*UTC[:7], 3)}, "time_unknown"),
         ({str(xbus.UTC_TIME): (0, 2000, *UTC[2:])}, "date_before_floor"),
+        ({str(xbus.UTC_TIME): (0, 9999, *UTC[2:])}, "bad_value"),
         ({str(xbus.LAT_LON): (91.0, 8.5)}, "bad_value"),
         ({str(xbus.ALTITUDE_ELLIPSOID): [math.nan]}, "bad_value"),
         ({str(xbus.QUATERNION | 4): (0.0, 0.0, 0.0, 0.0)}, "bad_value"),

@@ -359,6 +359,15 @@ def test_impossible_groups_are_counted() -> None:
         assert (records, parser.counters.bad_messages, parser.counters.errors) == ([], 1, {code: 1})
 
 
+def test_a_week_that_no_receiver_can_mean_gives_no_solution() -> None:
+    """Week 65535 is the year 3236, which nanoseconds since 1980 in 64 bits do not reach."""
+    status = pos.encode_gnss_status(GPS, 7, STATUS._replace(week=65535))
+    records, parser = parse_pos(status, pos.NAVIGATION.encode(GPS, NAVIGATION))
+    assert (of_type(records, InsSolution), parser.counters.errors) == ([], {"bad_time": 1, "time_unknown": 1})
+    records, parser = parse_gsof(gsof.encode_report([gsof.INS_NAVIGATION.encode(INS._replace(week=65535))], 1))
+    assert (records, parser.counters.errors) == ([], {"bad_time": 1})
+
+
 # --- both ---
 
 STREAMS: dict[str, tuple[type[GsofParser] | type[PosParser], Callable[[], bytes]]] = {
