@@ -271,7 +271,7 @@ def options(command: Any, name: str = "swath") -> Iterator[tuple[str, list[str]]
 
 def test_every_option_is_documented() -> None:
     pages = README + "".join(page.read_text() for page in (ROOT / "docs").rglob("*.md"))
-    stands = set(re.findall(r"(?<![\w-])--[a-z][a-z-]*", pages))
+    stands = set(re.findall(r"(?<![\w-])--[a-z][a-z0-9-]*", pages))
     known = options(get_command(make_app(None)))
     assert [f"{name} {words[0]}" for name, words in known if stands.isdisjoint(words)] == []
 

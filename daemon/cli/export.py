@@ -14,9 +14,12 @@ from swath.daemon.written import Reached, error_words, room_noted
 from swath.georef.progress import BYTES, Tell
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from swath.daemon.exchange.export import ExportReport
-    from swath.daemon.log.reader import Session
+    from swath.daemon.log.reader import PartDamage, Session
     from swath.daemon.processing.records.files import RecordFiles
+    from swath.daemon.processing.records.ros2 import RosExport
 
 LEAST_OF_RECORDS, MOST_OF_RECORDS = 0.1, 8.0  # the same of records: a slice as Parquet, and all as text
 LEAST_OF_LOG, MOST_OF_LOG = 0.7, 3.0  # size of exported files by that of the log, whose chunks are compressed
@@ -42,14 +45,19 @@ def command(
         str | None, typer.Option("--to", metavar="TIME", help="With --records: up to this time, UTC or GPS ns.")
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace earlier exports of the logs.")] = False,
+    ros2: Annotated[
+        bool, typer.Option("--ros2", help="Write ROS 2 bags with standard messages, for Foxglove, RViz and ROS.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
     """Write logs as serial streams (with RTKLIB's time tags), candump logs, pcap files and PPS text.
 
     What these formats cannot hold goes into a small file beside each; with it `swath import` makes the same log again.
-    With --records, the fixes, samples, returns and other records that the drivers decode, as tables. Exit code 4 when
-    the log is damaged; everything readable is still written.
+    With --records, the fixes, samples, returns and other records that the drivers decode, as tables; with --ros2, as
+    messages of a bag. Exit code 4 when the log is damaged; everything readable is still written.
     """
+    if records is not None and ros2:
+        raise UserError("--records and --ros2 are two exports; choose one of them", ExitCode.USAGE)
     if records is not None:
         _export_records(logs, directory, records, source or [], (begin, end), overwrite=overwrite, as_json=as_json)
         return
@@ -61,8 +69,15 @@ def command(
     from swath.daemon.log.format import LogError
     from swath.daemon.log.reader import open_logs
 
+    export: Callable[..., ExportReport | RosExport] = export_session
+    if ros2:
+        from swath.daemon.processing.requirements import require_installed
+
+        require_installed("export --ros2", "rosbags")
+        from swath.daemon.processing.records.ros2 import export_ros2 as export
+
     passed_over: list[str] = []
-    done: list[tuple[Session, ExportReport]] = []
+    done: list[tuple[Session, ExportReport | RosExport]] = []
     try:
         with progress_bar() as tell:
             sessions = open_logs(logs, passed_over)
@@ -72,7 +87,7 @@ def command(
                 reached = Reached(partial(_tell, tell, session.session_id))
                 session.progress = reached
                 with room_noted(directory, reached.share):
-                    done.append((session, export_session(session, directory, overwrite=overwrite)))
+                    done.append((session, export(session, directory, overwrite=overwrite)))
     except LogError as error:
         raise UserError(one_line(str(error)), ExitCode.IO) from error
     except OSError as error:
@@ -83,7 +98,8 @@ def command(
         for session, report in done:
             _print(session, report)
     lines = [f"passed over: {line}" for line in passed_over]
-    lines += [_damage(session) for session, _ in done if session.damage]
+    damaged = [[*session.damage, *getattr(report, "damage", ())] for session, report in done]
+    lines += [_damage(places) for places in damaged if places]
     if lines:
         raise UserError("\n".join(map(one_line, lines)), ExitCode.DAMAGE)
     if any(session.missing_parts for session, _ in done):
@@ -175,12 +191,11 @@ def _tell(tell: Tell, name: str, done: int, total: int) -> None:
     tell(f"exporting {name}", done, total, BYTES)
 
 
-def _plain(session: Session, report: ExportReport) -> dict[str, object]:
+def _plain(session: Session, report: ExportReport | RosExport) -> dict[str, object]:
     return {
         "session_id": session.session_id,
         "folder": str(report.folder),
-        "files": report.files,
-        "units": dict(report.units),
+        **report.plain(),
         "notes": report.notes,
         "missing_parts": session.missing_parts,
         "growing": None if session.growing is None else session.growing.name,
@@ -188,10 +203,10 @@ def _plain(session: Session, report: ExportReport) -> dict[str, object]:
     }
 
 
-def _print(session: Session, report: ExportReport) -> None:
+def _print(session: Session, report: ExportReport | RosExport) -> None:
     print(one_line(str(report.folder)))
-    for name, entry in report.files.items():
-        print(f"  {name}: {entry['kind']}, {entry['units']} units")
+    for line in report.lines():
+        print(one_line(f"  {line}"))
     for note in report.notes:
         print(one_line(f"  note: {note}"))
     for number in session.missing_parts:
@@ -200,7 +215,7 @@ def _print(session: Session, report: ExportReport) -> None:
         print(one_line(f"  {session.growing.name} is still being recorded; exported up to now"))
 
 
-def _damage(session: Session) -> str:
-    first = session.damage[0]
-    more = f" ({len(session.damage)} such places)" if len(session.damage) > 1 else ""
+def _damage(places: list[PartDamage]) -> str:
+    first = places[0]
+    more = f" ({len(places)} such places)" if len(places) > 1 else ""
     return f"{first.path} at byte {first.damage.offset}: {first.damage.what}{more}; everything readable was written"

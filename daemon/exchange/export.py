@@ -51,6 +51,14 @@ class ExportReport:
     units: Counter[str] = field(default_factory=Counter)
     notes: list[str] = field(default_factory=list)
 
+    def plain(self) -> dict[str, Any]:
+        """Return files and units as plain values for ``--json``."""
+        return {"files": self.files, "units": dict(self.units)}
+
+    def lines(self) -> list[str]:
+        """Return a line for each file."""
+        return [f"{name}: {entry['kind']}, {entry['units']} units" for name, entry in self.files.items()]
+
 
 def export_session(session: Session, directory: Path, *, overwrite: bool = False) -> ExportReport:
     """Write a session into ``directory/<session_id>``; the folder appears when it is complete.

@@ -13,6 +13,7 @@ PRINTED_PAGES = (*PAGES, "weasyprint")  # for HTML pages that are written as PDF
 GIS = ("rasterio", "fudgeo")  # for maps and features that a GIS reads
 EXTRA_OF = {
     "foxglove": "live",
+    "rosbags": "import",
     "rasterio": "gis",
     "fudgeo": "gis",
 }  # package: the extra that installs it, if not process

@@ -28,6 +28,7 @@ from swath.daemon.processing.navigation.times import imu_times
 from swath.daemon.processing.points.clocks import read_clocks
 from swath.daemon.processing.points.runs import Run
 from swath.daemon.processing.records.tables import KINDS, NO_TIME_NS, RecordKind, timed_rows
+from swath.daemon.processing.setup.models import geometry_of
 from swath.daemon.processing.setup.sources import Sources
 from swath.drivers.parser import DeviceKind, Parser, ParserCounters
 from swath.georef.arrays import Int64Array, StructArray
@@ -39,6 +40,7 @@ from swath.georef.records import (
     Record,
     ScannerReturns,
 )
+from swath.georef.scanner.beams import Geometry
 from swath.georef.stream.clocks import FrozenClocks, HostClocks, StreamClocks
 from swath.georef.timescales import SECOND_NS
 
@@ -169,6 +171,14 @@ class LogRecords:
                 found.clear()
         run.flush()
         yield [*found, *parser.close()]
+
+    def geometry(self, source: str) -> Geometry:
+        """Return the geometry of a scanner's beams.
+
+        Raises:
+            ValueError: it is not known; one line.
+        """
+        return geometry_of(self.config.scanner[source.removeprefix("scanner/")], self._parser(source))
 
     def _parser(self, source: str) -> Parser:
         return self._sources.parsers((self.sources[source],), whole=True)[source]

@@ -58,7 +58,9 @@ def flight(ros: Ros) -> tuple[list[Message], dict[str, list[tuple[int, bytes]]]]
     return messages, units
 
 
-@pytest.mark.parametrize("container", CONTAINERS)
+@pytest.mark.parametrize(
+    "container", [one if one == "mcap" else pytest.param(one, marks=pytest.mark.slow) for one in CONTAINERS]
+)
 def test_a_bag_is_imported_and_comes_out_of_an_export_as_it_went_in(tmp_path: Path, container: Container) -> None:
     messages, units = flight(Ros(container))
     file = write_bag(tmp_path / "flight", container, messages)
