@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] = ()) -> None:
     parser.add_argument("--megabytes", type=float, default=2000.0)
     parser.add_argument("--containers", nargs="+", choices=get_args(Container), default=get_args(Container))
     options = parser.parse_args(arguments)
-    print("| bag | MB | read MB/s | import MB/s | memory MB | import MB a CPU second | cp MB/s |")
+    print("| bag | MB | read MB/s | import MB/s | import MB a CPU second | memory MB | cp MB/s |")
     print("|---|---|---|---|---|---|---|")
     for container in options.containers:
         for size in (0.1e6 * options.megabytes, 1e6 * options.megabytes):
