@@ -154,7 +154,7 @@ class Packets:
         order, at = "<", 0
         if self.ros2:
             if data[:2] not in (b"\0\0", b"\0\1"):
-                raise ValueError("is not CDR")
+                raise ValueError("is not CDR; if its messages are compressed, give the folder of the bag")
             order, at = "<" if data[1] else ">", 4
         if self.header:  # stamp (ROS 1: behind a number), name of the frame
             at += 8 if self.ros2 else 12

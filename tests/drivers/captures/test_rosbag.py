@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from swath.drivers.captures.base import CaptureDamageError, CapturedUnit, CaptureTally
@@ -17,7 +17,17 @@ from swath.drivers.captures.opening import open_bag, read_bag, read_pcap
 from swath.drivers.captures.rosbag.messages import RAW_TYPES
 from swath.drivers.captures.rosbag.unwrap import Packets, Unit
 from swath.drivers.transports.base import TransportError
-from tests.drivers.captures.bags import CONTAINERS, START_NS, Container, Ros, Units, every_type, payloads, write_bag
+from tests.drivers.captures.bags import (
+    CONTAINERS,
+    START_NS,
+    Container,
+    Ros,
+    Units,
+    bag_writer,
+    every_type,
+    payloads,
+    write_bag,
+)
 from tests.drivers.recordings import FIXTURES
 
 RECORDED = {
@@ -95,6 +105,24 @@ def test_a_message_of_other_fields_than_its_type_is_damage(tmp_path: Path) -> No
     assert list(read_bag(tmp_path / "bag", ["/can"], tally)) == []
     assert tally.damage == 1
     assert "a message of /can is not can_msgs/msg/Frame: 'can_msgs__msg__Frame' object has no" in tally.first_damage
+
+
+@pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE, CompressionMode.STORAGE])
+def test_a_compressed_bag_is_read_by_its_folder(tmp_path: Path, mode: CompressionMode) -> None:
+    """Files and messages are compressed by rosbag2 itself, chunks by the container."""
+    container: Container = "mcap" if mode == CompressionMode.STORAGE else "db3"
+    ros, packets = Ros(container), payloads(568, 5)
+    writer, file = bag_writer(tmp_path / "bag", container)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/p", SCAN, typestore=ros.store)
+        scan = ros.scan(SCAN, PACKET, packets, length=1500, sized=True)
+        writer.write(connection, START_NS, ros.store.serialize_cdr(scan, SCAN))
+    assert by_topic(list(read_bag(tmp_path / "bag", ["/p"]))) == {"/p": packets}
+    if mode == CompressionMode.MESSAGE:
+        tally = CaptureTally()
+        assert not list(read_bag(file, ["/p"], tally))
+        assert "is not CDR; if its messages are compressed, give the folder" in tally.first_damage
 
 
 def test_big_endian_cdr_is_read() -> None:
