@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tests.daemon.short_flight import Flown, fly_short, two_lines
 
-DOCS = Path(__file__).resolve().parents[2] / "docs/library"
+ROOT = Path(__file__).resolve().parents[2]
 _BLOCK = re.compile(r"^```python( norun)?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -22,5 +22,5 @@ def fly(folder: Path, seconds: float = math.inf) -> Flown:
 
 
 def examples(page: str) -> list[tuple[str, bool]]:
-    """Return the Python blocks of a page of docs/library, and whether each can run on a short flight."""
-    return [(code, not norun) for norun, code in _BLOCK.findall((DOCS / page).read_text())]
+    """Return the Python blocks of a page, and whether each can run on a short flight."""
+    return [(code, not norun) for norun, code in _BLOCK.findall((ROOT / page).read_text())]

@@ -131,7 +131,7 @@ def test_a_track_of_arrays_is_checked_against_the_log(flown: Flown, log: swath.L
         swath.georeference(log, away, crs="EPSG:32632", min_strip_s=5.0)
 
 
-@pytest.mark.parametrize("page", ["logs.md", "processing.md"])
+@pytest.mark.parametrize("page", ["README.md", "docs/library/logs.md", "docs/library/processing.md"])
 def test_the_examples_of_the_documentation_run(
     flown: Flown, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, page: str
 ) -> None:
@@ -141,9 +141,9 @@ def test_the_examples_of_the_documentation_run(
     os.symlink(flown.folder / "left.true.toml", "left.toml")
     os.symlink(root / "fixtures/hesai/nebula_xt16.pcap.gz", "xt16.pcap")
     blocks = examples(page)
-    assert len(blocks) > 3
+    assert blocks
     names: dict[str, Any] = {}
     for code, runs in blocks:
-        compiled = compile(code, f"docs/library/{page}", "exec")
+        compiled = compile(code, page, "exec")
         if runs:
             exec(compiled, names)
