@@ -1,8 +1,9 @@
 """Airborne laser scanning, from the sensors' wires to the point cloud.
 
-``swath.open`` reads logs; ``swath.navigate``, ``swath.georeference`` and ``swath.calibrate`` process them. Below these,
-``swath.georef`` georeferences, ``swath.calib`` calibrates, ``swath.drivers`` reads devices, ``swath.daemon`` records
-and holds the command line, ``swath.sim`` flies a virtual aircraft.
+``swath.open`` reads logs; ``swath.navigate``, ``swath.georeference`` and ``swath.calibrate`` process them;
+``swath.aio`` opens devices in asyncio and follows a recorder. Below these, ``swath.georef`` georeferences,
+``swath.calib`` calibrates, ``swath.drivers`` reads devices, ``swath.daemon`` records and holds the command line,
+``swath.sim`` flies a virtual aircraft.
 """
 
 from __future__ import annotations
@@ -20,11 +21,14 @@ _NAMES = {
     "swath.processing": ("CalibrationResult", "PointCloud", "Track", "calibrate", "georeference", "navigate"),
 }
 _PLACES = {name: module for module, names in _NAMES.items() for name in names}
-__all__ = ["__version__", *sorted(_PLACES)]
+_MODULES = ("aio",)
+__all__ = ["__version__", *sorted([*_PLACES, *_MODULES])]
 
 
 def __getattr__(name: str) -> Any:
     """Return a public name from the module in which it is defined."""
+    if name in _MODULES:
+        return importlib.import_module(f"swath.{name}")
     if name not in _PLACES:
         raise AttributeError(f"module 'swath' has no attribute {name!r}")
     return getattr(importlib.import_module(_PLACES[name]), name)

@@ -1,3 +1,4 @@
+from swath import aio as aio
 from swath.daemon.errors import SwathError as SwathError
 from swath.logs import Capture as Capture
 from swath.logs import Log as Log

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import ctypes
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from swath.drivers.transports.base import UnitBlock
 from swath.georef.arrays import Int64Array
 
 STEP_NOTICED_NS = 50_000  # a change of REALTIME − MONOTONIC beyond this is a step of the wall clock
@@ -89,6 +90,23 @@ class StampConverter:
         self._step_ns = 0
         self._previous_read_ns = clock.now_ns()
         self.ambiguous = 0
+
+    def stamp(self, blocks: Sequence[UnitBlock]) -> list[Int64Array]:
+        """Return the host times of the units of each block of one reading: the kernel's, or that of the reading."""
+        counts = [len(block.units) for block in blocks]
+        if all(block.kernel_realtime_ns is None for block in blocks):  # serial ports have no kernel stamps
+            read_ns = self._clock.now_ns()
+            return [np.array([read_ns] * count, dtype=np.int64) for count in counts]
+        pair = read_clock_pair()
+        if len(blocks) == 1:
+            return [self.convert_at(blocks[0].kernel_realtime_ns, counts[0], pair)]
+        joined = np.concatenate(
+            [
+                np.zeros(count, np.int64) if block.kernel_realtime_ns is None else block.kernel_realtime_ns
+                for block, count in zip(blocks, counts, strict=True)
+            ]
+        )
+        return np.split(self.convert_at(joined, sum(counts), pair), np.cumsum(counts)[:-1])
 
     def convert_at(self, stamps_ns: Int64Array | None, count: int, pair: ClockPair) -> Int64Array:
         """Return the host times of the units of a batch.

@@ -306,7 +306,8 @@ class UnitReceiver(Receiver):
         blocks = self._session.receive(timeout_s)
         if not blocks:
             return None
-        times = self._stamp(blocks)
+        times = self.stamps.stamp(blocks)
+        self.account.ambiguous = self.stamps.ambiguous
         self._update_kernel_losses(force=False)
         for block, log_time_ns in zip(blocks, times, strict=True):
             self._hand_over(block, log_time_ns)
@@ -329,26 +330,6 @@ class UnitReceiver(Receiver):
         self._session.close()
         self._update_kernel_losses(force=True)
         self.tell_account(now=True)
-
-    def _stamp(self, blocks: list[UnitBlock]) -> list[Int64Array]:
-        counts = [len(block.units) for block in blocks]
-        if all(block.kernel_realtime_ns is None for block in blocks):  # serial ports have no kernel stamps
-            read_ns = self.shared.clock.now_ns()
-            return [np.array([read_ns] * count, dtype=np.int64) for count in counts]
-        pair = read_clock_pair()
-        if len(blocks) == 1:
-            host = self.stamps.convert_at(blocks[0].kernel_realtime_ns, counts[0], pair)
-            self.account.ambiguous = self.stamps.ambiguous
-            return [host]
-        joined = np.concatenate(
-            [
-                np.zeros(count, np.int64) if block.kernel_realtime_ns is None else block.kernel_realtime_ns
-                for block, count in zip(blocks, counts, strict=True)
-            ]
-        )
-        host = self.stamps.convert_at(joined, sum(counts), pair)
-        self.account.ambiguous = self.stamps.ambiguous
-        return np.split(host, np.cumsum(counts)[:-1])
 
     def _hand_over(self, block: UnitBlock, log_time_ns: Int64Array) -> None:
         count, length = block.units.shape

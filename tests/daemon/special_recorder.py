@@ -10,8 +10,8 @@ from typing import NoReturn
 
 from swath.daemon.config import load_config
 from swath.daemon.log.account import Account
+from swath.daemon.log.host_clock import StampConverter
 from swath.daemon.recorder.assembly import QUEUE_BYTES
-from swath.daemon.recorder.receivers import UnitReceiver
 from swath.daemon.recorder.run import record
 
 SMALL_QUEUE_BYTES = 300_000
@@ -33,7 +33,7 @@ def main(kind: str, config: Path) -> int:
 
         Account.statuses = statuses  # type: ignore[method-assign, assignment]
     elif kind == "broken-receiver":
-        UnitReceiver._stamp = _defect  # type: ignore[method-assign, assignment]
+        StampConverter.stamp = _defect  # type: ignore[method-assign, assignment]
     return int(record(load_config(config), queue_bytes=SMALL_QUEUE_BYTES if kind == "small-queue" else QUEUE_BYTES))
 
 

@@ -20,6 +20,7 @@ from swath.daemon.processing.navigation.observations import (
     heading_times,
 )
 from swath.daemon.processing.navigation.sources import NavigationSources
+from swath.daemon.processing.navigation.times import GrowingCounter
 from swath.georef.arrays import BoolArray, Int64Array, StructArray
 from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.rotations import attitude_of, rot_from_quaternion
@@ -27,7 +28,7 @@ from swath.georef.navigation.alignment.align import Aligner
 from swath.georef.navigation.filter.filter import NavigationFilter
 from swath.georef.navigation.inputs import OBSERVATION_DTYPE, Inertial, NavigationError, sort_observations
 from swath.georef.navigation.samples import Sampler
-from swath.georef.records import DEVICE_CLOCK_DTYPE, IMU_DTYPE, INS_DTYPE, GnssFix, GnssHeading, ImuSamples, Record
+from swath.georef.records import IMU_DTYPE, INS_DTYPE, GnssFix, GnssHeading, ImuSamples, Record
 from swath.georef.timescales import SECOND_NS, WEEK_NS
 
 if TYPE_CHECKING:
@@ -39,7 +40,6 @@ HOLD_S = 0.3  # maximum delay of fixes after the samples of their time
 TIME_WAIT_NS = 5 * SECOND_NS  # longest wait for a clock that is not known yet
 MAX_TIME_SIGMA_NS = 1e7  # of a sample: a worse time is not used
 REALIGN_NS = 30 * SECOND_NS  # of missing samples: after them the attitude is aligned anew
-PAUSE_NS = SECOND_NS // 2  # of arrivals: after it a unit without a counter is assumed to have missed samples
 KEPT_NS = 10 * SECOND_NS  # of samples before the start that was found
 EPOCH_LASTS_NS = 2 * SECOND_NS  # all messages of one epoch come within it
 NEVER_NS = 1 << 62
@@ -75,7 +75,7 @@ class Navigator:
         self._latest_heading_ns = -(1 << 62)
         self._kept: list[Inertial] = []
         self._kept_rows: list[StructArray] = []
-        self._counter = _Counter(table.rate_hz)
+        self._counter = GrowingCounter(table.rate_hz)
 
     @property
     def state(self) -> str:
@@ -217,38 +217,6 @@ def navigator_of(config: Config, attachments: Mapping[str, bytes], clocks: Strea
         return Navigator(NavigationSources(config, attachments), clocks)
     except (UserError, NavigationError):
         return None
-
-
-class _Counter:
-    """Passes the samples' counters with the host's time to the clock.
-
-    Samples without a counter get one: one nominal interval each, and the host's time over pauses.
-    """
-
-    def __init__(self, rate_hz: float) -> None:
-        self._interval_ns = SECOND_NS / rate_hz
-        self._count_ns = 0.0
-        self._host_ns: int | None = None
-
-    def told(self, rows: StructArray, clocks: StreamClocks, source: str) -> StructArray:
-        """Return rows with a device time; rows that have GPS time themselves need no clock."""
-        if (rows["gps_week"] >= 0).any() or source not in clocks.host.plan.devices:
-            return rows
-        bare = np.flatnonzero(rows["device_time_ns"] < 0).tolist()
-        if bare:
-            rows = rows.copy()
-        for place in bare:
-            host_ns = int(rows["host_time_ns"][place])
-            step = 0 if self._host_ns is None else host_ns - self._host_ns
-            self._count_ns += step if step > PAUSE_NS else self._interval_ns
-            self._host_ns = host_ns
-            rows["device_time_ns"][place] = round(self._count_ns)
-        said = np.zeros(len(rows), DEVICE_CLOCK_DTYPE)
-        for name in ("host_time_ns", "device_time_ns", "pps_time_ns"):
-            said[name] = rows[name]
-        said["pps_count"] = said["locked"] = -1
-        clocks.add_samples(source, said)
-        return rows
 
 
 def poses(path: Path) -> StructArray:

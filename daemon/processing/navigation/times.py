@@ -10,7 +10,7 @@ import numpy as np
 
 from swath.georef.arrays import BoolArray, FloatArray, Int64Array, StructArray
 from swath.georef.records import DEVICE_CLOCK_DTYPE
-from swath.georef.stream.clocks import HostClocks
+from swath.georef.stream.clocks import HostClocks, StreamClocks
 from swath.georef.timescales import SECOND_NS, WEEK_NS, DeviceClock
 from swath.georef.trajectory.trajectory import gps_span_text
 
@@ -169,6 +169,38 @@ def counted_arrivals(host_ns: Int64Array, rate_hz: float) -> Int64Array:
     counter = np.concatenate([[0.0], np.cumsum(np.where(paused, steps, interval_ns))])
     device_ns: Int64Array = np.rint(counter).astype(np.int64)
     return device_ns
+
+
+class GrowingCounter:
+    """Passes the samples' counters with the host's time to the clock.
+
+    Samples without a counter get one: one nominal interval each, and the host's time over pauses.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._interval_ns = SECOND_NS / rate_hz
+        self._count_ns = 0.0
+        self._host_ns: int | None = None
+
+    def told(self, rows: StructArray, clocks: StreamClocks, source: str) -> StructArray:
+        """Return rows with a device time; rows that have GPS time themselves need no clock."""
+        if (rows["gps_week"] >= 0).any() or source not in clocks.host.plan.devices:
+            return rows
+        bare = np.flatnonzero(rows["device_time_ns"] < 0).tolist()
+        if bare:
+            rows = rows.copy()
+        for place in bare:
+            host_ns = int(rows["host_time_ns"][place])
+            step = 0 if self._host_ns is None else host_ns - self._host_ns
+            self._count_ns += step if step > PAUSE_S * SECOND_NS else self._interval_ns
+            self._host_ns = host_ns
+            rows["device_time_ns"][place] = round(self._count_ns)
+        said = np.zeros(len(rows), DEVICE_CLOCK_DTYPE)
+        for name in ("host_time_ns", "device_time_ns", "pps_time_ns"):
+            said[name] = rows[name]
+        said["pps_count"] = said["locked"] = -1
+        clocks.add_samples(source, said)
+        return rows
 
 
 def _reasons(**counts: int) -> Counter[str]:

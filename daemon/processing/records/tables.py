@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.daemon.devices.listening import Times
 from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.records import (
     AIMED_RETURN_DTYPE,
@@ -25,6 +26,7 @@ from swath.georef.records import (
     GnssHeading,
     ImuSamples,
     InsSolution,
+    Record,
     ScannerReturns,
     TimeMessage,
     TimeTag,
@@ -214,6 +216,23 @@ KINDS = {
         RecordKind("returns", ScannerReturns, RETURN_TABLE),
     )
 }
+
+
+def table_of(kind: RecordKind, records: Sequence[Record], times: Sequence[Times]) -> StructArray:
+    """Return a table of the records of a kind among others, with their times; empty if there are none.
+
+    Args:
+        kind: of `KINDS`.
+        records: of any types, in order.
+        times: theirs; empty: no times are known.
+    """
+    chosen = [place for place, record in enumerate(records) if isinstance(record, kind.record)]
+    table = kind.table([records[place] for place in chosen])
+    if len(table) and times:
+        table["gps_ns"] = np.concatenate([times[place].gps_ns for place in chosen])
+        table["time_sigma_s"] = np.concatenate([times[place].sigma_s for place in chosen])
+    return table
+
 
 # Names of the parts of a vector's columns, by field; the unit ends the name, as it does in all scalar columns.
 _COVARIANCES = ("nn", "ne", "nd", "ee", "ed", "dd")

@@ -1,0 +1,351 @@
+"""Gives records GPS times as they come, by clocks that know what came before them, and follows a growing log."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import threading
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from swath.daemon.config.config import Config
+from swath.daemon.devices.listening import QUEUE_BYTES, Batch, Status, Times, decoded_counts, row_count
+from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.log.follow import LogFollower, PartFollower
+from swath.daemon.log.format import LogError, SessionInfo, source_of_topic
+from swath.daemon.log.host_messages import edges_of, readings_of
+from swath.daemon.log.mcap.chunks import LogBatch
+from swath.daemon.log.parsers import stored_config
+from swath.daemon.processing.navigation.observations import gps_times
+from swath.daemon.processing.navigation.times import GrowingCounter
+from swath.daemon.processing.points.runs import Run
+from swath.daemon.processing.records.tables import NO_TIME_NS
+from swath.daemon.processing.setup.sources import Sources
+from swath.drivers.listening import LoopReader, Overflow
+from swath.drivers.parser import DeviceKind
+from swath.georef.arrays import FloatArray, Int64Array, StructArray
+from swath.georef.records import (
+    ChunkBatch,
+    DeviceClockSamples,
+    EventMark,
+    ImuSamples,
+    InsSolution,
+    PpsEdge,
+    Record,
+    ScannerReturns,
+    TimeMessage,
+    TimeScale,
+)
+from swath.georef.stream.clocks import DevicePlan, StreamClocks
+from swath.georef.timescales import SECOND_NS, WEEK_NS
+
+POLL_S = 0.05
+LOG = "log"  # the one lane of a log
+_EVERY_KIND: tuple[DeviceKind, ...] = ("gnss", "imu", "scanner", "corrections", "raw")
+
+
+class LiveClocks:
+    """The clocks of a running session; any thread may call them.
+
+    Args:
+        sources: the devices.
+        info: of the session, for its host time.
+    """
+
+    def __init__(self, sources: Sources, info: SessionInfo) -> None:
+        plan = sources.clock_plan(info)
+        self._counters: dict[str, GrowingCounter] = {}
+        imus: dict[str, DevicePlan] = {}
+        for name, imu in sources.config.imu.items():
+            clock = sources.clock_of(imu.pps)
+            if clock is not None:
+                imus[f"imu/{name}"] = DevicePlan(clock)
+                self._counters[f"imu/{name}"] = GrowingCounter(imu.rate_hz)
+        self._clocks = StreamClocks.growing(replace(plan, devices={**plan.devices, **imus}))
+        self._host = self._clocks.host
+        self._first = next(iter(self._host.by_source), None)
+        self._lock = threading.Lock()
+
+    def add_reading(
+        self, realtime_ns: int, monotonic_ns: int, monotonic_raw_ns: int, max_error_s: float = math.inf
+    ) -> None:
+        """Take the host's clocks, read side by side."""
+        with self._lock:
+            self._clocks.add_reading(realtime_ns, monotonic_ns, monotonic_raw_ns, max_error_s)
+
+    def add_edge(self, source: str, edge: PpsEdge) -> None:
+        """Take an edge of ``pps/name``."""
+        with self._lock:
+            self._clocks.add_edge(source, edge)
+
+    def take(self, source: str, records: Sequence[Record], *, late: bool = False) -> list[Times]:
+        """Take records of a source in order of arrival, and return their times.
+
+        Args:
+            source: ``kind/name``.
+            records: as its parser gives them.
+            late: their host times may be too late by any time; what arrival means for a clock is then not used.
+        """
+        if not records:
+            return []
+        with self._lock:
+            counted = [self._hear(source, record, late=late) for record in records]
+            self._clocks.update()
+            times = [self._rows_times(source, rows) if rows is not None else None for rows in counted]
+            single = [record for record, found in zip(records, times, strict=True) if found is None]
+            others = iter(self._event_times(source, single))
+        return [next(others) if found is None else found for found in times]
+
+    def state(self, source: str, host_ns: int) -> tuple[str, float] | None:
+        """Return a clock's state and sigma, s, by its source; None: the source is no clock."""
+        with self._lock:
+            if source not in self._host.by_source:
+                return None
+            self._clocks.update()
+            status = self._host.status(source, host_ns)
+        return status.state.name, status.sigma_ns / SECOND_NS if math.isfinite(status.sigma_ns) else math.nan
+
+    def _hear(self, source: str, record: Record, *, late: bool) -> Record | StructArray | None:
+        """Give a record to the clocks; return it if it has rows, with counted samples, else None."""
+        plan = self._host.plan
+        if isinstance(record, TimeMessage) and source in plan.gnss and not late:
+            self._clocks.add_message(source, record)
+        elif isinstance(record, DeviceClockSamples) and source in plan.devices and not late:
+            self._clocks.add_samples(source, record.rows)
+        elif isinstance(record, ImuSamples) and source in self._counters and not late:
+            return ImuSamples(self._counters[source].told(record.rows, self._clocks, source))
+        return record if isinstance(record, ImuSamples | InsSolution | ScannerReturns | DeviceClockSamples) else None
+
+    def _rows_times(self, source: str, record: Any) -> Times:
+        """Return the times of a record with rows."""
+        rows = record.rows
+        if isinstance(record, InsSolution):
+            known = rows["gps_ns"] >= 0
+            return _times(np.where(known, rows["gps_ns"], NO_TIME_NS), np.where(known, 0.0, math.nan))
+        if isinstance(record, ImuSamples) and (rows["gps_week"] >= 0).any():
+            known = rows["gps_week"] >= 0
+            own_ns = rows["gps_week"].astype(np.int64) * WEEK_NS + rows["device_time_ns"]
+            return _times(np.where(known, own_ns, NO_TIME_NS), np.where(known, 0.0, math.nan))
+        if isinstance(record, DeviceClockSamples) or source not in self._host.plan.devices:
+            return self._arrivals(source, rows["host_time_ns"])
+        gps_ns, sigma_ns = self._clocks.gps_from_device(source, rows["device_time_ns"], rows["host_time_ns"])
+        return _by_clock(gps_ns, np.where(rows["device_time_ns"] >= 0, sigma_ns, math.inf))
+
+    def _arrivals(self, source: str, host_ns: Int64Array) -> Times:
+        clock = source if source in self._host.by_source else self._first
+        if clock is None:
+            return _times(np.full(len(host_ns), NO_TIME_NS), np.full(len(host_ns), math.nan))
+        return _by_clock(*self._host.gps_from_host(clock, host_ns))
+
+    def _event_times(self, source: str, records: Sequence[Any]) -> list[Times]:
+        """Return the times of records without rows: those that they name, else those of their arrival."""
+        if not records:
+            return []
+        arrived = np.array([record.host_time_ns for record in records], np.int64)
+        by_arrival = self._arrivals(source, arrived)
+        tags = [getattr(record, "time", None) for record in records]
+        clock = source if source in self._host.by_source else None
+        named = gps_times(self._host, clock, arrived.tolist(), tags)
+        found: list[Times] = []
+        for at, (record, tag, gps_ns) in enumerate(zip(records, tags, named, strict=True)):
+            if tag is None and not hasattr(record, "time"):
+                found.append(Times(by_arrival.gps_ns[at : at + 1], by_arrival.sigma_s[at : at + 1]))
+                continue
+            sigma_s = math.nan if gps_ns is None else self._named_sigma_s(source, record)
+            found.append(_times(np.array([NO_TIME_NS if gps_ns is None else gps_ns]), np.array([sigma_s])))
+        return found
+
+    def _named_sigma_s(self, source: str, record: Any) -> float:
+        """Return the sigma of a time that a record names: 0, the receiver's own, or 1 s if leap seconds are a guess."""
+        own = record.sigma_s if isinstance(record, EventMark) and record.sigma_s is not None else 0.0
+        if record.time.scale is TimeScale.UTC and source in self._host.by_source:
+            return max(own, 1.0) if self._host.status(source, record.host_time_ns).leap_doubt else own
+        return float(own)
+
+
+def _times(gps_ns: Any, sigma_s: Any) -> Times:
+    return Times(np.asarray(gps_ns, np.int64), np.asarray(sigma_s, np.float64))
+
+
+def _by_clock(gps_ns: Int64Array, sigma_ns: FloatArray) -> Times:
+    """Return times of a clock that is not known everywhere."""
+    known = np.isfinite(sigma_ns)
+    return _times(np.where(known, gps_ns, NO_TIME_NS), np.where(known, sigma_ns / SECOND_NS, math.nan))
+
+
+def live_clocks(config: Config, info: SessionInfo) -> LiveClocks:
+    """Return the clocks of a configuration's devices, before anything was heard."""
+    return LiveClocks(Sources(config, {}, sorted(config.scanner)), info)
+
+
+class LogListening:
+    """Follows the log that a recorder writes, in a thread of its own, for one task of an asyncio loop.
+
+    Args:
+        directory: of the recorder's logs.
+        tail_s: how much of an already existing recording is read first.
+        overflow, queue_bytes: as in `swath.daemon.devices.listening.Listening`; the lane is the whole log's. A thread
+            that waits reads the file later: nothing is lost.
+
+    Attributes:
+        session_id: of the recording that is followed; empty before the first.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        *,
+        tail_s: float = 0.0,
+        overflow: Overflow = Overflow.WAIT,
+        queue_bytes: int = QUEUE_BYTES,
+    ) -> None:
+        self.session_id = ""
+        self._directory = directory
+        self._reader: LoopReader[Batch] = LoopReader(queue_bytes, overflow)
+        self._follower = LogFollower(directory, tail_s)
+        self._part: PartFollower | None = None
+        self._session: _SessionDecoder | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="follow", daemon=True)
+
+    async def __aenter__(self) -> Self:
+        """Begin to follow."""
+        self._thread.start()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Close the log and wait for the thread, also if the task was cancelled."""
+        await asyncio.shield(asyncio.to_thread(self.close))
+
+    def close(self) -> None:
+        """Close the log and wait for the thread."""
+        self._stop.set()
+        self._reader.backlog.close()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    async def take(self) -> Batch | None:
+        """Wait for the batch that came first; None: following has ended, and all batches are taken.
+
+        Raises:
+            UserError: the log's configuration cannot be used.
+            BusyError: another task waits for a batch already.
+        """
+        return await self._reader.take()
+
+    def status(self, source: str) -> Status:
+        """Return state and counts of a source; its state is that of the log: following, or waiting for a recording."""
+        state = "waiting" if self._follower.sign is None else "following"
+        found = Status(source, state, dropped=self._reader.backlog.dropped(LOG))
+        return found if self._session is None else self._session.with_counts(found)
+
+    @property
+    def sources(self) -> list[str]:
+        """Names of the devices in the log that is followed."""
+        return [] if self._session is None else list(self._session.parsers)
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                for batch in self._follower.poll():
+                    self._take(batch)
+                    if self._stop.is_set():
+                        break
+                if self._session is not None:
+                    self._session.flush()
+                self._stop.wait(POLL_S)
+        except Exception as error:
+            self._reader.backlog.fail(error)
+        finally:
+            self._follower.close()
+
+    def _take(self, batch: LogBatch) -> None:
+        part = self._follower.part
+        if part is not self._part and part is not None:
+            self._part = part
+            if part.info.session_id != self.session_id:
+                self.session_id = part.info.session_id
+                self._session = _SessionDecoder(part, self._put)
+        if self._session is not None:
+            self._session.take(batch)
+
+    def _put(self, batch: Batch) -> None:
+        self._reader.backlog.put(LOG, batch.measured)
+
+
+class _SessionDecoder:
+    """Decodes one session's messages in the order of its log.
+
+    Scanners' units are joined before they are decoded, because each call of a parser costs as much as many units; the
+    others are decoded at once, because clocks depend on them.
+    """
+
+    def __init__(self, part: PartFollower, put: Callable[[Batch], None]) -> None:
+        try:
+            config = stored_config(part.attachments)
+            if config is None:
+                raise UserError("holds no configuration, by which it could be decoded")
+            self._sources = Sources(config, part.attachments, sorted(config.scanner))
+            self.parsers = self._sources.parsers(_EVERY_KIND, whole=True)
+        except (UserError, LogError) as error:
+            raise UserError(f"{part.path}: {error}", ExitCode.IO) from error
+        self._clocks = LiveClocks(self._sources, part.info)
+        self._put = put
+        self._units: Counter[str] = Counter()
+        self._bytes: Counter[str] = Counter()
+        self._records: dict[str, Counter[str]] = {source: Counter() for source in self.parsers}
+        self._runs: dict[str, Run] = {}
+
+    def take(self, batch: LogBatch) -> None:
+        """Take messages of one channel."""
+        topic = batch.channel.topic
+        source = source_of_topic(topic)
+        if topic == "/clock":
+            for reading in readings_of(batch):
+                self._clocks.add_reading(*reading)
+        elif source is not None and source.startswith("pps/"):
+            edge = self._sources.edge_of(source)
+            for found in edges_of(batch, edge) if edge is not None else ():
+                if found is not None:
+                    self._clocks.add_edge(source, found)
+        elif source is not None:
+            device = source.removesuffix("/aux")
+            self._units[device] += len(batch.units)
+            self._bytes[device] += batch.units.size
+            run = self._runs.setdefault(source, Run(partial(self._parse, source)))
+            run.add(ChunkBatch(source, batch.log_time_ns, batch.units))
+            if not device.startswith("scanner/"):
+                run.flush()
+
+    def flush(self) -> None:
+        """Decode the units that wait to be decoded together."""
+        for run in self._runs.values():
+            run.flush()
+
+    def _parse(self, wire: str, units: list[ChunkBatch]) -> None:
+        batch = Batch(wire, units, {})
+        for source in self._sources.inside(wire.removesuffix("/aux")):
+            records = self.parsers[source].feed_batches(units)
+            batch.records[source] = records
+            batch.times[source] = self._clocks.take(source, records)
+            for record in records:
+                self._records[source][type(record).__name__] += row_count(record)
+        self._put(batch)
+
+    def with_counts(self, status: Status) -> Status:
+        """Return a source's status with its counts."""
+        source = status.source
+        if source not in self.parsers:
+            return status
+        return replace(
+            status,
+            units=self._units[source],
+            bytes=self._bytes[source],
+            **decoded_counts(self.parsers[source], self._records[source]),
+        )
