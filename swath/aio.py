@@ -64,6 +64,12 @@ class Received:
         """Yield source and record."""
         return iter((self.source, self.record))
 
+    @property
+    def host_time_ns(self) -> Int64Array:
+        """Host times (n,) of arrival of the record's rows, ns since 1970."""
+        rows = getattr(self.record, "rows", None)
+        return np.array([getattr(self.record, "host_time_ns", 0)]) if rows is None else rows["host_time_ns"]
+
 
 def _received(batch: Batch) -> Iterator[Received]:
     for source, records in batch.records.items():

@@ -1,20 +1,17 @@
 """Opens everything that a configuration names for some seconds and reports the answer and the faults of each device.
 
-It writes and sends nothing. Every wire has its own thread, so all are heard at the same time.
+It writes and sends nothing, and listens as `swath.aio` does: to all wires at the same time.
 """
 
 from __future__ import annotations
 
-import math
+import asyncio
+import contextlib
 import os
 import tempfile
-import threading
-import time
 from collections import Counter
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import AsyncIterator, Iterable
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from shutil import disk_usage
 from typing import Any
@@ -23,46 +20,26 @@ import numpy as np
 
 from swath.daemon.config import Config, DeviceEntry
 from swath.daemon.devices.identify import Heard, describe_time, not_understood
+from swath.daemon.devices.listening import Batch, Decoder, Listening
 from swath.daemon.devices.values import Values
 from swath.daemon.log.directory import nearest_there
 from swath.daemon.log.host_clock import ClockDiscipline, read_clock_discipline
-from swath.daemon.log.wires import Senders, mixed_text
+from swath.daemon.log.wires import mixed_text
 from swath.drivers.driver import RAW, find_driver
+from swath.drivers.listening import Listener
 from swath.drivers.parser import PacketParser
 from swath.drivers.session import Session
-from swath.drivers.transports.base import RawEdge, TransportCounters, UnitBlock
+from swath.drivers.transports.base import RawEdge, TransportCounters
 from swath.drivers.transports.can.bitrate import interface_bitrate
-from swath.drivers.transports.opening import open_pps, open_transport
-from swath.drivers.transports.spec import TransportSpec, parse_pps
+from swath.drivers.transports.spec import TransportSpec
 from swath.georef.records import ChunkBatch, Record, TimeMessage
 from swath.georef.timescales import SECOND_NS, ahead_s, distance_text
 from swath.georef.timescales.stamp_scale import ABSOLUTE_FROM_NS, NEVER_SET_S, date_text
 
-SLICE_S = 0.1
 KEPT_BYTES = 1 << 20  # of each wire, to identify a device that does not use the configured protocol
 DAMAGED_SHARE = 0.01  # of the messages; a larger share is a fault of wire or settings, not chance
 CLOCK_RATE_FACTOR = 5.0  # a counter faster or slower by this factor is read in the wrong unit
 EDGE_SPACING_TOLERANCE_S = 0.05  # of a user-space stamp on a busy computer
-
-
-@dataclass(slots=True)
-class Span:
-    """The time to listen: ``seconds``, or until ``stop`` is set."""
-
-    seconds: float
-    stop: threading.Event = field(default_factory=threading.Event)
-    _ends_s: float = field(default=math.inf, init=False)
-
-    def is_over(self) -> bool:
-        """Return True if listening has ended."""
-        return self.stop.is_set() or time.monotonic() > self._ends_s
-
-    def listen(self, session: Session[Any]) -> Iterable[list[Any]]:
-        """Yield the blocks that a session receives until the time is up."""
-        deadline_s = self._ends_s = time.monotonic() + self.seconds
-        while not self.stop.is_set() and (left_s := deadline_s - time.monotonic()) > 0:
-            if got := session.receive(min(SLICE_S, left_s)):
-                yield got
 
 
 @dataclass(slots=True)
@@ -122,32 +99,32 @@ class Report:
 
 
 class Reading:
-    """One device's parser, its results, and the first bytes. Two ports of a head feed the same parser."""
+    """One device: the results of its parser, and the first bytes of its own port."""
 
-    def __init__(self, entry: DeviceEntry) -> None:
-        self.entry = entry
-        self.report = Report(entry.source, entry.protocol)
+    def __init__(self, decoder: Decoder) -> None:
+        self.entry, self.parser = decoder.entry, decoder.parser
+        self.report = Report(self.entry.source, self.entry.protocol)
         self.heard = Heard()
-        driver = find_driver(entry.kind, entry.protocol)
-        self.values = Values(line_scanner=driver.line_scanner)
-        self.parser = driver.make_parser(entry.settings)
+        self.values = Values(line_scanner=find_driver(self.entry.kind, self.entry.protocol).line_scanner)
         self.kept: list[ChunkBatch] = []
         self._kept_bytes = 0
-        self._lock = threading.Lock()
 
-    def feed(self, batch: ChunkBatch, *, main: bool) -> None:
-        """Take units of the device's own port, or of its second one."""
-        with self._lock:
-            self._take(self.parser.feed_batch(batch))
-            if main:
-                self.report.add(batch)
-                if self._kept_bytes < KEPT_BYTES:
-                    self._kept_bytes += batch.units.size
-                    self.kept.append(ChunkBatch(batch.source, batch.host_time_ns, batch.units.copy()))
+    def take(self, records: list[Record]) -> None:
+        """Take decoded records of any of its ports."""
+        self.heard.add(records)
+        self.values.add(records)
+
+    def keep(self, units: list[ChunkBatch]) -> None:
+        """Count units of the device's own port, and keep the first."""
+        for batch in units:
+            self.report.add(batch)
+            if self._kept_bytes < KEPT_BYTES:
+                self._kept_bytes += batch.units.size
+                self.kept.append(ChunkBatch(batch.source, batch.host_time_ns, batch.units.copy()))
 
     def finish(self) -> None:
         """Complete the report after the last byte: the device's time, and its faults."""
-        self._take(self.parser.close())
+        self.take(self.parser.close())
         self.report.records = self.heard.counts
         if self.report.bytes:
             self.report.time = describe_time(self.entry, self.heard)
@@ -160,91 +137,73 @@ class Reading:
             self.report.notes += [] if never_set else lock_notes(self.entry, self.heard)
             self.report.notes += far_notes(self.heard, read_clock_discipline())
 
-    def _take(self, records: list[Record]) -> None:
-        self.heard.add(records)
-        self.values.add(records)
-
-
-class Wire:
-    """One port, socket or bus, and the readings that use its bytes."""
-
-    def __init__(self, report: Report, spec: TransportSpec, readings: list[Reading], *, main: bool) -> None:
-        self.report = report
-        self._spec = spec
-        self._readings = readings
-        self._main = main
-        self._senders = Senders()
-
-    def listen(self, span: Span) -> None:
-        """Feed the readings until the time is up; then report the faults of the wire."""
-        session = Session(lambda: open_transport(self._spec, span.is_over))
-        for blocks in span.listen(session):
-            for block in blocks:
-                batch = _batch(self.report.source, block)
-                if block.peer is not None:
-                    times_ns = batch.host_time_ns
-                    self._senders.add(block.peer[0], int(times_ns[0]), int(times_ns[-1]), len(times_ns))
-                for reading in self._readings:
-                    reading.feed(batch, main=self._main)
-                if not self._main:
-                    self.report.add(batch)
-        self._say(session, span.seconds)
-        session.close()
-
-    def _say(self, session: Session[Any], seconds: float) -> None:
-        counters = session.poll_counters()
-        for report in [reading.report for reading in self._readings] if self._main else [self.report]:
-            report.opens = session.openings > 0
-            report.problems += _wire_problems(session, counters, report, seconds)
-            if self._senders.mixed and report.protocol != RAW:
-                report.problems.append(mixed_text(self._senders.counts, recorded=False))
-            if self._spec.kind == "can" and self._spec.interface == "socketcan":
-                report.problems += bitrate_problems(self._spec, interface_bitrate(self._spec.channel))
-            if counters.refused:
-                what = "unreadable messages or lines; check the speed of the adapter"
-                if self._spec.kind == "udp":
-                    what = f"datagrams from senders other than the configured source: {counters.refused_text()}"
-                report.notes.append(f"{counters.refused} {what}")
-
 
 def check_everything(config: Config, seconds: float) -> list[Report]:
     """Listen to all sources of a configuration at once for ``seconds``, and return their reports."""
-    span = Span(seconds)
-    readings = {entry.source: Reading(entry) for entry in config.devices()}
-    reports = [Report(f"pps/{name}", pps.source) for name, pps in config.pps.items()]
-    jobs: list[Callable[[], None]] = [
-        partial(check_pps, report, pps.edge, span) for report, pps in zip(reports, config.pps.values(), strict=True)
-    ]
-    for reading in readings.values():
-        reports.append(reading.report)
-        for wire in _wires(reading, readings):
-            jobs.append(partial(wire.listen, span))
-            if wire.report is not reading.report:
-                reports.append(wire.report)
-    _run(jobs, span)
+    return asyncio.run(_check_everything(config, seconds))
+
+
+async def _check_everything(config: Config, seconds: float) -> list[Report]:
+    listening = Listening(config)
+    readings = {source: Reading(decoder) for source, decoder in listening.decoders.items()}
+    edges: dict[str, list[RawEdge]] = {f"pps/{name}": [] for name in config.pps}
+    reports = {f"pps/{name}": Report(f"pps/{name}", pps.source) for name, pps in config.pps.items()}
+    for source, reading in readings.items():
+        reports[source] = reading.report
+        if reading.entry.auxiliary is not None:
+            reports[f"{source}/aux"] = Report(f"{source}/aux", reading.entry.protocol)
+    async for batch in _batches(listening, seconds):
+        if batch.edges:
+            edges[batch.wire] += batch.edges
+        for source, records in batch.records.items():
+            readings[source].take(records)
+            if batch.wire in readings:
+                readings[source].keep(batch.units)
+        if batch.wire not in readings:
+            for units in batch.units:
+                reports[batch.wire].add(units)
+    for name, pps in config.pps.items():
+        source = f"pps/{name}"
+        report_pps(reports[source], pps.edge, listening.listeners[source], edges[source], seconds)
+    for wire in listening.specs:
+        inside = [reading.report for reading in readings.values() if reading.entry.transport.carrier == wire]
+        for report in [reports[wire], *inside]:
+            report_wire(report, listening, wire, seconds)
     for reading in readings.values():
         reading.finish()
-    return [*reports, check_directory(Path(config.session.directory), config.session.reserve_mb)]
+    return [*reports.values(), check_directory(Path(config.session.directory), config.session.reserve_mb)]
 
 
-def _wires(reading: Reading, readings: dict[str, Reading]) -> Iterable[Wire]:
-    """Yield the wires of a device; devices inside its stream read along, and have no wires of their own."""
-    entry = reading.entry
-    if entry.transport.carrier is not None:
-        return
-    inside = [other for other in readings.values() if other.entry.transport.carrier == entry.source]
-    yield Wire(reading.report, entry.transport, [reading, *inside], main=True)
-    if entry.auxiliary is not None:
-        yield Wire(Report(f"{entry.source}/aux", entry.protocol), entry.auxiliary, [reading, *inside], main=False)
+async def _batches(listening: Listening, seconds: float) -> AsyncIterator[Batch]:
+    """Yield what the wires give in a time; then close them and yield the rest."""
+    loop = asyncio.get_running_loop()
+    async with listening:
+        ends_s = loop.time() + seconds
+        with contextlib.suppress(TimeoutError):
+            while (left_s := ends_s - loop.time()) > 0:
+                async with asyncio.timeout(left_s):
+                    batch = await listening.take()
+                if batch is not None:
+                    yield batch
+    while (batch := await listening.take()) is not None:
+        yield batch
 
 
-def _run(jobs: list[Callable[[], None]], span: Span) -> None:
-    with ThreadPoolExecutor(max_workers=max(1, len(jobs)), thread_name_prefix="check") as pool:
-        try:
-            for future in [pool.submit(job) for job in jobs]:
-                future.result()
-        finally:
-            span.stop.set()  # an interrupt ends listening at once
+def report_wire(report: Report, listening: Listening, wire: str, seconds: float) -> None:
+    """Report the faults of a wire, after it was closed."""
+    listener, spec, senders = listening.listeners[wire], listening.specs[wire], listening.senders[wire]
+    counters = listener.counters
+    report.opens = listener.session.openings > 0
+    report.problems += _wire_problems(listener.session, counters, report, seconds)
+    if senders.mixed and report.protocol != RAW:
+        report.problems.append(mixed_text(senders.counts, recorded=False))
+    if spec.kind == "can" and spec.interface == "socketcan":
+        report.problems += bitrate_problems(spec, interface_bitrate(spec.channel))
+    if counters.refused:
+        what = "unreadable messages or lines; check the speed of the adapter"
+        if spec.kind == "udp":
+            what = f"datagrams from senders other than the configured source: {counters.refused_text()}"
+        report.notes.append(f"{counters.refused} {what}")
 
 
 def check_directory(directory: Path, reserve_mb: float) -> Report:
@@ -271,23 +230,17 @@ def check_directory(directory: Path, reserve_mb: float) -> Report:
     return report
 
 
-def check_pps(report: Report, edge: str, span: Span) -> None:
-    """Count and check the edges of the PPS source that the report's protocol names."""
-    session: Session[RawEdge] = Session(lambda: open_pps(parse_pps(report.protocol, edge=edge)))
-    edges: list[RawEdge] = []
-    for got in span.listen(session):
-        edges += got
-    session.close()
-    if refused := session.poll_counters().refused:
+def report_pps(report: Report, edge: str, listener: Listener[Any, Batch], edges: list[RawEdge], seconds: float) -> None:
+    """Check the edges of a pulse."""
+    session = listener.session
+    if refused := listener.counters.refused:
         report.notes.append(f"{refused} lines are not edges; want 'realtime_ns sequence', both whole numbers")
     report.opens, report.units = session.openings > 0, len(edges)
     report.records["edges"] = len(edges)
     if session.last_error:
         report.problems.append(f"disconnected: {session.last_error}" if report.opens else session.last_error)
     elif not edges:
-        report.problems.append(
-            f"no {edge} edge in {span.seconds:g} s; check the wiring and the PPS output of the receiver"
-        )
+        report.problems.append(f"no {edge} edge in {seconds:g} s; check the wiring and the PPS output of the receiver")
     stamps = np.array([item.realtime_ns for item in edges], dtype=np.int64)
     if len(stamps) > 1:
         spacing_s = float(np.median(np.diff(stamps))) * 1e-9
@@ -296,14 +249,6 @@ def check_pps(report: Report, edge: str, span: Span) -> None:
             report.problems.append(f"edges are {spacing_s:.4f} s apart, want 1 s; check for noise or another signal")
     if any(not item.kernel_stamp for item in edges):
         report.notes.append("time-stamped by this program, not by the kernel; errors of tens of microseconds")
-
-
-def _batch(source: str, block: UnitBlock) -> ChunkBatch:
-    now_ns = time.time_ns()
-    stamps = np.full(len(block.units), now_ns, dtype=np.int64)
-    if block.kernel_realtime_ns is not None:
-        stamps = np.where(block.kernel_realtime_ns > 0, block.kernel_realtime_ns, now_ns).astype(np.int64)
-    return ChunkBatch(source, stamps, block.units)
 
 
 def _wire_problems(session: Session[Any], counters: TransportCounters, report: Report, seconds: float) -> Iterable[str]:

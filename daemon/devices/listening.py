@@ -27,6 +27,7 @@ from swath.daemon.log.host_clock import (
     read_clock_pair,
     read_clock_sample,
 )
+from swath.daemon.log.wires import Senders
 from swath.drivers.driver import find_driver
 from swath.drivers.listening import Listener, LoopReader, Measured, Overflow
 from swath.drivers.parser import Parser
@@ -38,6 +39,7 @@ from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.records import ChunkBatch, PpsEdge, Record
 
 READING_S = 0.1  # between two readings of the host's clocks
+EDGE_BYTES = 100
 QUEUE_BYTES = 64 << 20  # of each wire: raw units and decoded rows that the loop has not taken yet
 
 Told = Callable[[SessionState, str], None]
@@ -82,19 +84,22 @@ class Batch:
         units: raw units with their host times, as received.
         records: decoded, by source: of the device, and of those inside its stream.
         times: GPS times of these records, in their order; empty without clocks.
+        edges: of a pulse, as they were stamped; such a batch has nothing else.
     """
 
     wire: str
     units: list[ChunkBatch]
     records: dict[str, list[Record]]
     times: dict[str, list[Times]] = field(default_factory=dict)
+    edges: list[RawEdge] = field(default_factory=list)
 
     @property
     def measured(self) -> Measured[Batch]:
         """The batch with its size."""
         raw_bytes = sum(one.units.size for one in self.units)
         rows = sum(getattr(record, "rows", _NO_ROWS).nbytes for records in self.records.values() for record in records)
-        return Measured(self, raw_bytes + rows, sum(len(one.units) for one in self.units), raw_bytes)
+        size_bytes = raw_bytes + rows + EDGE_BYTES * len(self.edges)
+        return Measured(self, size_bytes, sum(len(one.units) for one in self.units) + len(self.edges), raw_bytes)
 
 
 _NO_ROWS = np.empty(0, np.uint8)
@@ -180,6 +185,7 @@ class Listening:
         decoders: by source.
         listeners: by wire: ``pps/main``, ``scanner/left``, ``scanner/left/aux``.
         specs: transports by wire, without the pulses.
+        senders: counts of datagrams by sender, by wire.
     """
 
     def __init__(
@@ -194,6 +200,7 @@ class Listening:
         self.decoders = {entry.source: Decoder(entry) for entry in config.devices()}
         self.listeners: dict[str, Listener[Any, Batch]] = {}
         self.specs: dict[str, TransportSpec] = {}
+        self.senders: dict[str, Senders] = {}
         self._clocks = None if make_clocks is None else make_clocks(self.clock)
         self._read_clocks = threading.Lock()
         self._read_s = -math.inf
@@ -216,7 +223,7 @@ class Listening:
             inside = [other for other in self.decoders.values() if other.entry.transport.carrier == source]
             yield source, entry.transport, [decoder, *inside]
             if entry.auxiliary is not None:
-                yield f"{source}/aux", entry.auxiliary, [decoder]
+                yield f"{source}/aux", entry.auxiliary, [decoder, *inside]
 
     def _add(self, wire: str, make: Callable[[], Any], decode: Callable[[list[Any], bool], Measured[Batch]]) -> None:
         def session(told: Told) -> Session[Any]:
@@ -230,7 +237,7 @@ class Listening:
 
     def _units(self, wire: str, decoders: Sequence[Decoder]) -> Callable[[list[UnitBlock], bool], Measured[Batch]]:
         """Return the function that decodes a wire's blocks."""
-        stamps = StampConverter(self.clock)
+        stamps, senders = StampConverter(self.clock), self.senders.setdefault(wire, Senders())
 
         def decode(blocks: list[UnitBlock], late: bool) -> Measured[Batch]:
             times = stamps.stamp(blocks)
@@ -238,6 +245,9 @@ class Listening:
                 ChunkBatch(wire, at, block.units if block.rows is not None else block.units.copy())
                 for at, block in zip(times, blocks, strict=True)
             ]
+            for at, block in zip(times, blocks, strict=True):
+                if block.peer is not None and len(at):
+                    senders.add(block.peer[0], int(at[0]), int(at[-1]), len(at))
             doubtful = late and any(block.kernel_realtime_ns is None for block in blocks)
             batch = Batch(wire, units, {})
             for decoder in decoders:
@@ -261,7 +271,7 @@ class Listening:
             if self._clocks is not None:
                 for edge, host_ns in zip(edges, times.tolist(), strict=True):
                     self._clocks.add_edge(source, PpsEdge(host_ns, edge.sequence))
-            return Measured(None, 0, len(edges), 0)
+            return Batch(source, [], {}, edges=edges).measured
 
         return take
 
