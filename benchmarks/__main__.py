@@ -11,6 +11,7 @@ from benchmarks import (
     decode,
     georef,
     georef_log,
+    listen,
     navigation,
     navigation_honesty,
     navigation_seeds,
@@ -29,3 +30,4 @@ adjustment.main()
 planes.main()
 clock.main()
 acquire.main()
+listen.main()

@@ -1,6 +1,7 @@
 """Send loads for the recording benchmarks, each from a process of its own: datagrams by sendmmsg(2), and CAN frames.
 
 python -m benchmarks.senders udp PORT BYTES RATE SECONDS   prints the number sent and the seconds it took
+python -m benchmarks.senders vlp16 PORT FILE RATE SECONDS  the same, with a head's datagram, stamped anew each time
 python -m benchmarks.senders can CHANNEL RATE SECONDS      prints the number sent
 """
 
@@ -11,11 +12,16 @@ import os
 import socket
 import sys
 import time
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
+from swath.georef.records import ByteRows
+
 _libc = ctypes.CDLL(None, use_errno=True)
 _SLOTS = 256
+_VLP16_STAMP = 1200  # offset of the microseconds past the hour, u32 (VLP-16 User Manual, 9.3.1.4)
 _HEADER = np.dtype(
     {
         "names": ["iov", "iovlen"],
@@ -35,6 +41,29 @@ def send_udp(port: int, length: int, rate: float, seconds: float) -> tuple[int, 
     rng = np.random.default_rng(1)
     units = rng.integers(0, 256, (_SLOTS, length), dtype=np.uint8)
     numbers = units[:, :8].view("<u8")[:, 0]
+
+    def fill(first: int, count: int) -> None:
+        numbers[:count] = np.arange(first, first + count)
+
+    return _send(port, units, fill, rate, seconds)
+
+
+def send_vlp16(port: int, datagram: bytes, rate: float, seconds: float) -> tuple[int, float]:
+    """Send a VLP-16's datagram at a rate, with the microseconds past the hour of each; return as `send_udp` does."""
+    units = np.tile(np.frombuffer(datagram, np.uint8), (_SLOTS, 1))
+    stamps = units[:, _VLP16_STAMP : _VLP16_STAMP + 4].view("<u4")[:, 0]
+
+    def fill(first: int, count: int) -> None:
+        stamps[:count] = np.arange(first, first + count) * 1e6 / rate
+
+    return _send(port, units, fill, rate, seconds)
+
+
+def _send(
+    port: int, units: ByteRows, fill: Callable[[int, int], None], rate: float, seconds: float
+) -> tuple[int, float]:
+    """Send rows of units at a rate; ``fill`` numbers the first rows, from a number on."""
+    length = units.shape[1]
     iovecs = np.zeros(_SLOTS, _IOVEC)
     iovecs["base"] = units.ctypes.data + np.arange(_SLOTS) * length
     iovecs["len"] = length
@@ -51,7 +80,7 @@ def send_udp(port: int, length: int, rate: float, seconds: float) -> tuple[int, 
             if due <= 0:
                 time.sleep(0.0005)
                 continue
-            numbers[:due] = np.arange(sent, sent + due)
+            fill(sent, due)
             count = _libc.sendmmsg(fd, ctypes.c_void_p(at), due, 0)
             if count < 0:
                 raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
@@ -78,6 +107,8 @@ def main() -> None:
     kind, *rest = sys.argv[1:]
     if kind == "udp":
         print(*send_udp(int(rest[0]), int(rest[1]), float(rest[2]), float(rest[3])))
+    elif kind == "vlp16":
+        print(*send_vlp16(int(rest[0]), Path(rest[1]).read_bytes(), float(rest[2]), float(rest[3])))
     else:
         print(send_can(rest[0], float(rest[1]), float(rest[2])))
 

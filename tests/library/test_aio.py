@@ -116,6 +116,7 @@ async def first(items: Any, count: int) -> Any:
     ("arguments", "words"),
     [
         (("udp:0.0.0.0:2368", "vlp16"), "unknown protocol 'vlp16'; did you mean velodyne-vlp16?"),
+        (("udp:0.0.0.0:56300", "livox-mid360"), 'is of several kinds; add kind="imu" or kind="scanner"'),
         (("can:socketcan:can0", "nmea"), r"swath.aio.open: gnss.device.transport: .*can:"),
         (("seriell:/dev/nowhere", "nmea"), "transport 'seriell:/dev/nowhere': want serial:<path>"),
         (("udp:0.0.0.0:2368", "srep"), "swath.aio.open: scanner.device.mirror_factor: missing; srep needs it"),
@@ -128,6 +129,14 @@ def test_a_wrong_device_is_answered_in_a_sentence(arguments: tuple[str, ...], wo
     with pytest.raises(swath.SwathError, match=words) as caught:
         swath.aio.open(transport, protocol, **options)
     assert "\n" not in str(caught.value)
+
+
+def test_a_pulse_is_opened_beside_its_device() -> None:
+    device = swath.aio.open("serial:/dev/nowhere", "nmea", pps="/dev/pps7")
+    assert list(device._listening.listeners) == ["pps/main", "gnss/device"]
+    assert (device.status.state, device.status.time_state) == ("opening", "NO_TIME")
+    with pytest.raises(swath.SwathError, match=r"pps\.main\.source: PPS source 'pps7': want /dev/pps0"):
+        swath.aio.open("serial:/dev/nowhere", "nmea", pps="pps7")
 
 
 def test_wrong_settings_of_the_queue_are_answered_in_a_sentence(tmp_path: Path) -> None:

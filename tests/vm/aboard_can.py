@@ -11,6 +11,7 @@ import struct
 import time
 from array import array
 from pathlib import Path
+from typing import Any
 
 from tests.vm.aboard import SHARED, TREE, WORK, Recorder, keep, main, recording, say, session, sh, wait_until
 
@@ -37,10 +38,24 @@ packet_counter = "SAMPLE.packet_counter"
 """
 
 
+DBC = "fixtures/config/imu.dbc"
+OF_THE_UNIT: dict[str, Any] = {
+    "dbc": str(TREE / DBC),
+    "rate_hz": 1000.0,
+    "tick_hz": 1_000_000.0,
+    "signals": {
+        "specific_force": ["ACC.acc_x", "ACC.acc_y", "ACC.acc_z"],
+        "angular_rate": ["GYR.gyr_x", "GYR.gyr_y", "GYR.gyr_z"],
+        "sample_ticks": "SAMPLE.ticks",
+        "packet_counter": "SAMPLE.packet_counter",
+    },
+}
+
+
 def imu(name: str, channel: str, rate_hz: int, options: str = "") -> str:
     """Return an [imu.<name>] table for an interface."""
     WORK.mkdir(parents=True, exist_ok=True)
-    dbc = shutil.copy(TREE / "fixtures/config/imu.dbc", WORK)  # the project's folder may be open to root only
+    dbc = shutil.copy(TREE / DBC, WORK)  # the project's folder may be open to root only
     return IMU.format(name=name, channel=channel, rate_hz=rate_hz, dbc=dbc, options=options)
 
 
@@ -136,6 +151,41 @@ def rate(seconds: str) -> None:
         times = send_samples([Bus("vcan0")], 1000, 1000 * int(seconds))
         say(f"sent in {(times[-1] - times[0]) * 1e-9:.2f} s")
     (SHARED / "sent").write_bytes(times.tobytes())
+
+
+def listen(count: str) -> None:
+    """Listen to the unit by `swath.aio` at 1 kHz, in records, and send to it."""
+    import asyncio
+
+    import numpy as np
+
+    import swath.aio
+    from swath.georef.records import ImuSamples
+
+    make_vcan()
+    samples, numbers, host_ns = int(count), [], []
+
+    async def hear() -> swath.aio.Status:
+        async with swath.aio.open("can:socketcan:vcan0", protocol="dbc", **OF_THE_UNIT) as unit:
+            # the bus binds its thread to a processor
+            sending = asyncio.create_task(asyncio.to_thread(lambda: send_samples([Bus("vcan0")], 1000, samples)))
+            async for record in unit.records():
+                if isinstance(record, ImuSamples):
+                    axes = np.rint(record.rows["specific_force_b"][:, :2] / 0.005).astype(int)
+                    numbers.extend((axes[:, 0] + axes[:, 1] * 32768).tolist())
+                    host_ns.extend(record.rows["host_time_ns"].tolist())
+                if len(numbers) == samples:
+                    break
+            times = await sending
+            offset_ns = time.time_ns() - time.monotonic_ns()
+            late_ns = np.array(host_ns) - offset_ns - np.array(times[4::6])  # of each sample's last frame
+            keep("late", {"median_ns": int(np.median(late_ns)), "most_ns": int(late_ns.max())})
+            await unit.send(FRAME.pack(0x7, 2, b"hi"))
+            return unit.status
+
+    status = asyncio.run(asyncio.wait_for(hear(), 100.0 + samples / 100.0))
+    counts = {"units": status.units, "lost_kernel": status.lost_kernel, "dropped": status.dropped}
+    keep("heard", {**counts, "damaged": status.damaged, "in_order": numbers == list(range(samples))})
 
 
 def overrun(count: str) -> None:
@@ -264,4 +314,13 @@ def controllers(seconds: str) -> None:
 
 
 if __name__ == "__main__":
-    main({"rate": rate, "overrun": overrun, "trouble": trouble, "bus_off": bus_off, "controllers": controllers})
+    main(
+        {
+            "rate": rate,
+            "listen": listen,
+            "overrun": overrun,
+            "trouble": trouble,
+            "bus_off": bus_off,
+            "controllers": controllers,
+        }
+    )

@@ -71,6 +71,17 @@ def test_can_at_1_khz_is_recorded_without_loss_and_with_kernel_timestamps(tmp_pa
     assert last_status(content, "imu/main").get("stamp_ambiguous", 0) == 0
 
 
+def test_asyncio_hears_every_sample_of_a_bus_with_kernel_timestamps(tmp_path: Path) -> None:
+    samples = 5000
+    finished = aboard(tmp_path, "aboard_can", "listen", samples, seconds=30)
+    heard = facts(tmp_path, "heard")
+    in_order = heard.pop("in_order")
+    assert in_order, finished.output
+    assert heard == {"units": 3 * samples, "lost_kernel": 0, "dropped": 0, "damaged": 0}
+    late = facts(tmp_path, "late")
+    assert -CLOCKS_NS < late["median_ns"] < 1_000_000, late  # a reading of many frames may come 16 ms later
+
+
 def test_can_overruns_are_counted_exactly(tmp_path: Path) -> None:
     sent = 20_000  # the buffer has space for about 2700
     aboard(tmp_path, "aboard_can", "overrun", sent, seconds=25)
