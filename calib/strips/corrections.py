@@ -94,8 +94,11 @@ class Components:
     Attributes:
         mean, sigma: (6,) m, rad; a component that is not determined has mean 0 and its prior sigma.
         of_calibration: (6,) part of `sigma` that errors of the held calibration have, m, rad; 0: its file tells none.
+            Of an outweighed component: the size of these errors.
         redundancy: (6,) share of the prior variance that the returns take away.
         determined: (6,) flags of components that the returns determine; the others are not corrected.
+        outweighed: (6,) flags of components that would be determined, were the held calibration's errors in them not
+            larger than the prior sigma.
         absorbs: (6, 6) [i, j]: component i contains the error of component j, which is held. The sigma of i is that of
             their sum.
         datum: (6,) flags of components that are held because, without control, those of other strips are related to
@@ -107,6 +110,7 @@ class Components:
     of_calibration: FloatArray
     redundancy: FloatArray
     determined: BoolArray
+    outweighed: BoolArray
     absorbs: BoolArray
     datum: BoolArray
 
@@ -115,7 +119,8 @@ class Components:
         """Return components that all hold the datum."""
         no = np.zeros(ERRORS, np.bool_)
         zero, unknown = np.zeros(ERRORS), np.full(ERRORS, np.nan)
-        return cls(zero, unknown, zero.copy(), zero.copy(), no, np.zeros((ERRORS, ERRORS), np.bool_), ~no)
+        absorbs = np.zeros((ERRORS, ERRORS), np.bool_)
+        return cls(zero, unknown, zero.copy(), zero.copy(), no, no.copy(), absorbs, ~no)
 
 
 @dataclass(frozen=True, slots=True)
@@ -507,11 +512,12 @@ class _Choice:
             one = Components.held()
             one.mean[named] = prior[named] * found.values[at]
             one.of_calibration[named] = prior[named] * np.sqrt(np.sum(found.held[at] ** 2, axis=1))
-            one.sigma[named] = np.hypot(
-                prior[named] * np.sqrt(np.diag(found.covariance)[at]), one.of_calibration[named]
+            by_returns = prior[named] * np.sqrt(np.diag(found.covariance)[at])
+            one.sigma[named] = np.where(
+                found.outweighed[at], prior[named], np.hypot(by_returns, one.of_calibration[named])
             )
             one.redundancy[named] = np.maximum(1.0 - found.left[at], 0.0)
-            one.determined[named] = found.determined[at]
+            one.determined[named], one.outweighed[named] = found.determined[at], found.outweighed[at]
             for both in ((ALONG, PITCH), (PITCH, ALONG)):
                 one.absorbs[both] = one.determined[both[0]] and both[1] in own.component[at[found.merged[at]]]
             one.datum[named] = False

@@ -8,7 +8,8 @@ factor of their misclosures. All unknowns are estimated together, each with its 
 
     x̂ = C b / f,   C = (N / f + 1)⁻¹
 
-An unknown is determined if at most 1/16 of its prior variance is left, C_ii. Only these estimates are used. The others
+An unknown is determined if at most 1/16 of its prior variance is left, C_ii, and the held calibration's errors move its
+estimate by no more than its prior sigma. Only these estimates are used. The others
 stay in the equations so that their errors do not go into the estimates that are used.
 """
 
@@ -23,6 +24,7 @@ from swath.georef.arrays import BoolArray, FloatArray, Int64Array
 
 LEAST_KNOWN = 15.0  # times the prior's information; below, a quarter or more of the prior's sigma is left
 MOST_LEFT = 1.0 / (1.0 + LEAST_KNOWN)  # share of the prior variance that the returns may leave
+MOST_OF_CALIBRATION = 1.0  # of the prior variance; beyond it, the correction is likely to be worse than none
 MOST_LEFT_OF_BENDS = 0.5  # their prior is the stiffness of a curve that is determined as a whole
 ALONG, DOWN, PITCH = 0, 2, 4  # indices of components
 ORDERS = 3  # of a component's parameters: constant, drift, bends
@@ -92,12 +94,15 @@ class Solved:
         square: χ² with all estimates.
         freedom: number of parameters that the returns know of, in part: the trace of N (N + 1)⁻¹.
         determined: (u,) flags.
+        outweighed: (u,) flags of parameters that the returns determine, but that the held calibration's errors move by
+            more than their prior sigma.
         merged: (u,) flags of parameters whose error another one of the strip contains, because the returns show only
             their sum.
         left: (u,) share of the prior variance that the returns leave.
         covariance: (u, u) of the errors of `values` by the returns; of a parameter that contains a merged one: of the
             sum's.
-        held: (u, h) by how much one sigma of each independent error of the held calibration moves `values`.
+        held: (u, h) by how much one sigma of each independent error of the held calibration moves `values`, or would
+            move one that it outweighs.
     """
 
     values: FloatArray
@@ -105,6 +110,7 @@ class Solved:
     square: float
     freedom: float
     determined: BoolArray
+    outweighed: BoolArray
     merged: BoolArray
     left: FloatArray
     covariance: FloatArray
@@ -140,9 +146,11 @@ class Solved:
         determined = _determined(left, unknowns) & free
         held = -covariance @ np.where(free[:, np.newaxis], quadratic.held[columns], 0.0) / factor
         held[~determined] = 0.0
+        outweighed = _outweighed(np.sum(held**2, axis=1), unknowns) & determined
+        determined &= ~outweighed
         covariance[np.ix_(~determined, ~determined)] = np.eye(int((~determined).sum()))
         values = np.where(determined, whole, 0.0)
-        return cls(values, whole, square, freedom, determined, merged, left, covariance, held)
+        return cls(values, whole, square, freedom, determined, outweighed, merged, left, covariance, held)
 
 
 def _left(normal: FloatArray, factor: float) -> FloatArray:
@@ -161,6 +169,18 @@ def _determined(left: FloatArray, unknowns: Unknowns) -> BoolArray:
         lacking = unknowns.part[~own & (unknowns.order == order - 1)] + 1
         own &= ~np.isin(unknowns.part, lacking)
     return np.asarray(own)
+
+
+def _outweighed(moved: FloatArray, unknowns: Unknowns) -> BoolArray:
+    """Return flags (u,) of parameters whose variance by the calibration, ``moved`` (u,), exceeds the prior's.
+
+    A component's bends count together, and where a constant or a drift is outweighed, what follows it is too.
+    """
+    mean = np.bincount(unknowns.part, moved) / np.maximum(np.bincount(unknowns.part), 1)
+    beyond = mean[unknowns.part] > MOST_OF_CALIBRATION
+    for order in (1, 2):
+        beyond |= np.isin(unknowns.part, unknowns.part[beyond & (unknowns.order == order - 1)] + 1)
+    return np.asarray(beyond)
 
 
 def _merged(left: FloatArray, unknowns: Unknowns) -> BoolArray:

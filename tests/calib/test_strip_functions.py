@@ -339,6 +339,28 @@ def test_the_held_calibration_is_part_of_the_sigmas(clean: tuple[Flight, Feature
     assert (with_it.fit.attitude_sigma_rad[mine] >= without.fit.attitude_sigma_rad[mine]).all()
 
 
+def test_a_calibration_that_may_be_far_off_corrects_no_strip(clean: tuple[Flight, Features]) -> None:
+    """A roll that is known to 1° moves the strips by more than the prior sigmas, however good the returns are."""
+    flight, features = clean
+    bad = spoilt(flight, 3, np.tile([0.0, 0.0, 0.15, 0.0, 0.0, 0.0], (2, 1)))
+    (start,) = flight.starts().values()
+    sigmas = np.zeros(len(INDEX))
+    sigmas[INDEX["omega_rad"]] = np.radians(1.0)
+    told = replace(start, sigmas=sigmas, held_sigmas=np.zeros(len(INDEX)), correlation=np.eye(len(INDEX)))
+    result = adjust_strips(
+        bad, features, {start.scanner: told}, replace(Settings(), models=("none", "constant", "linear"))
+    )
+    for choice in result.choices:
+        own = choice.components
+        assert (own.mean[~own.determined] == 0.0).all()
+        assert (own.of_calibration[own.determined] <= PRIORS[own.determined]).all()
+    outweighed = np.array([choice.components.outweighed for choice in result.choices])
+    sizes = np.array([choice.components.of_calibration for choice in result.choices])
+    assert outweighed[:, 3].any()  # roll
+    assert (sizes[outweighed] > np.broadcast_to(PRIORS, sizes.shape)[outweighed]).all()
+    assert not np.abs(result.fit.attitude_rad[:, 0]).max() > 3.0 * PRIORS[3]
+
+
 def test_more_strips_than_the_limit_share_one_model(
     clean: tuple[Flight, Features], monkeypatch: pytest.MonkeyPatch
 ) -> None:

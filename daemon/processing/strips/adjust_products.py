@@ -121,6 +121,10 @@ class _Strip:
         own = self.choice.components
         if own.datum[component]:
             return "without control this strip holds the datum"
+        if own.outweighed[component]:
+            factor, unit = FACTORS[component], "cm" if component < len(AXES) else "mdeg"
+            size = factor * float(own.of_calibration[component])
+            return f"{NOT_DETERMINED}: errors of the held calibration move it by {size:.0f} {unit}"
         if not own.determined[component]:
             share = 100.0 * (1.0 - math.sqrt(max(1.0 - float(own.redundancy[component]), 0.0)))
             return f"{NOT_DETERMINED}: the returns reduce the prior sigma by {share:.0f} %, and 75 % are needed"
@@ -248,7 +252,8 @@ def _legend(settings: Settings, strips: Sequence[_Strip]) -> list[str]:
     if NOT_DETERMINED in shown:
         lines.append(
             f"{NOT_DETERMINED}: the returns leave more than a quarter of the prior sigma of "
-            f"{CM * settings.position_m:.0f} cm or {MDEG * settings.turn_rad:.0f} mdeg; the component is not corrected"
+            f"{CM * settings.position_m:.0f} cm or {MDEG * settings.turn_rad:.0f} mdeg, or the held calibration may be "
+            "off by more than it; the component is not corrected"
         )
     if "0" in shown:
         lines.append("0: the strip agrees with the others without a correction")
