@@ -97,12 +97,14 @@ class BagListing:
     Attributes:
         path, kind: of the bag; "ROS 1" or "ROS 2".
         topics: all, by name.
+        finished: False if its recorder was stopped before it wrote the index; what precedes that is listed.
         sections: text of the proposed configuration's sections.
     """
 
     path: Path
     kind: str
     topics: list[ListedTopic]
+    finished: bool = True
     sections: list[str] = field(default_factory=list)
 
     def configuration(self) -> str:
@@ -122,6 +124,8 @@ class BagListing:
         """Return the list, as comments, and the configuration."""
         total = sum(one.topic.count for one in self.topics if not one.topic.name.endswith(SECOND))
         lines = [f"# {one_line(str(self.path))}: {self.kind} bag, {total} messages of {len(self.topics)} topics"]
+        if not self.finished:
+            lines[0] += "; it has no index, because its recorder was stopped"
         for one in self.topics:
             when = f" from {_utc(one.span_ns[0])} to {_utc(one.span_ns[1])}" if one.span_ns else ""
             lines += [one_line(f"#   {one.topic.name} ({one.topic.kind}): {one.topic.count} messages{when}")]
@@ -137,6 +141,7 @@ class BagListing:
         return {
             "file": str(self.path),
             "kind": self.kind,
+            "finished": self.finished,
             "topics": [
                 {
                     "topic": one.topic.name,
@@ -166,7 +171,7 @@ def list_bag(path: Path) -> BagListing:
     with open_bag(path) as bag:
         topics = [_listed(bag, topic) for topic in sorted(bag.topics.values(), key=lambda topic: topic.name)]
         topics = [one for one in topics if one.read or not one.topic.name.endswith(SECOND)]
-        listing = BagListing(path, bag.kind, topics)
+        listing = BagListing(path, bag.kind, topics, bag.finished)
     listing.sections = _Proposal(topics).sections()
     return listing
 

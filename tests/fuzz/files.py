@@ -142,8 +142,7 @@ def _bags() -> Target:
             messages = [one for one in every_type(Ros(container))[0] if one[1] in _FUZZED_TYPES]
             seeds.append(write_bag(Path(folder, container), container, messages).read_bytes())
     target = _captures("bag", seeds, _read_bag)
-    # rosbags asks for as many bytes as a damaged length says, and gets those of the file
-    return dataclasses.replace(target, peak_bytes=lambda size: 5 << 30)
+    return dataclasses.replace(target, peak_bytes=lambda size: (64 << 20) + 400 * size)  # rosbags compiles definitions
 
 
 def _read_bag(path: Path, tally: CaptureTally | None) -> Iterator[object]:

@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from swath.drivers.captures.base import CaptureDamageError, CapturedUnit, CaptureTally, report
-from swath.drivers.captures.rosbag.kinds import HEAD_BYTES, MCAP, ROS1, SQLITE, bag_kind
+from swath.drivers.captures.rosbag.kinds import HEAD_BYTES, MCAP, ROS1, SQLITE, BoundedPath, bag_kind
 from swath.drivers.captures.rosbag.messages import (
     DECODED_TYPES,
     RAW_TYPES,
@@ -30,14 +30,11 @@ from swath.drivers.captures.rosbag.messages import (
     BagTopic,
     RawType,
 )
+from swath.drivers.captures.rosbag.unfinished import Unfinished, UnfinishedMcap, UnfinishedRos1
 from swath.drivers.captures.rosbag.unwrap import Decoded, Form, Packets, Unwrapper
 from swath.drivers.transports.base import TransportError
 
-_MEND = {  # the tools that complete a bag whose recorder was stopped
-    SQLITE: "; give the folder with its metadata.yaml, or complete it with `ros2 bag reindex`",
-    ROS1: "; complete it with `rosbag reindex`",
-    MCAP: "; complete it with `mcap recover`",
-}
+_MAGICS = (SQLITE, ROS1, MCAP)
 _SPANS_NS = (10**9, 60 * 10**9, 3600 * 10**9)  # tried one after the other to find a topic's last message
 
 
@@ -46,6 +43,7 @@ class Bag:
 
     Attributes:
         kind: "ROS 1" or "ROS 2".
+        finished: False for a bag without its index, whose recorder was stopped.
         topics: all topics, by name.
         offsets_ns: of each topic that was read and whose units have times of their own, the first unit's time less the
             bag's time of its message.
@@ -60,6 +58,7 @@ class Bag:
         self.kind = "ROS 1" if self._magic == ROS1 else "ROS 2"
         self._reader = self._opened()
         self._connections: list[Connection] = self._reader.connections
+        self.finished = not isinstance(self._reader, Unfinished)
         self.topics = {topic.name: topic for topic in self._topics()}
         self.offsets_ns: dict[str, int] = {}
 
@@ -71,22 +70,29 @@ class Bag:
             raise TransportError(f"{path}: {error.strerror}") from error
         if not bag_kind(path, head):
             raise TransportError(f"{path}: is no bag, or one that is compressed as a whole; unpack it first")
-        return next(magic for magic in _MEND if head.startswith(magic))
+        return next(magic for magic in _MAGICS if head.startswith(magic))
 
     def _opened(self) -> Any:
-        plugins = Ros2Reader.STORAGE_PLUGINS
+        """Return the library's reader, or the own one of a bag without its index."""
+        plugins, path = Ros2Reader.STORAGE_PLUGINS, BoundedPath(self.path)
+        others: dict[bytes, Any] = {ROS1: UnfinishedRos1, MCAP: UnfinishedMcap}
         try:
             if not self._magic:
-                reader: Any = plugins["dir"](self.path)
+                reader: Any = plugins["dir"](path)
             elif self._magic == ROS1:
-                reader = Ros1Reader(self.path)
+                reader = Ros1Reader(path)
             elif self._magic == SQLITE:
                 reader = plugins[".db3"](Path(quote(str(self.path))))  # it is opened by a URI
             else:
-                reader = plugins[".mcap"](self.path)
+                reader = plugins[".mcap"](path)
             reader.open()
         except Exception as error:  # a damaged file makes the library raise anything
-            mend = _MEND.get(self._magic, "")
+            if self._magic in others:
+                reader = others[self._magic](path)
+                with suppress(Exception):  # what the library said of it tells more
+                    reader.open()
+                    return reader
+            mend = "; give the folder with its metadata.yaml" if self._magic == SQLITE else ""
             raise TransportError(f"{self.path}: cannot be read as a bag: {_words(error)}{mend}") from error
         return reader
 
@@ -126,16 +132,19 @@ class Bag:
     def span_ns(self, name: str) -> tuple[int, int] | None:
         """Return the bag's times of the first and the last message of a topic; None if it has none, or is damaged."""
         connections = [one for one in self._connections if one.topic == name.removesuffix(SECOND)]
-        with suppress(Exception):
-            first_ns = next(self._reader.messages(connections))[1]
-            end_ns = self._end_ns()
-            for span_ns in (*_SPANS_NS, end_ns):
-                last_ns = max(
-                    (time for _, time, _ in self._reader.messages(connections, start=end_ns - span_ns)), default=0
-                )
-                if last_ns:
-                    return first_ns, last_ns
+        first_ns = next(self._times(connections, 0), None)
+        end_ns = self._end_ns()
+        for span_ns in (*_SPANS_NS, end_ns):
+            last_ns = max(self._times(connections, end_ns - span_ns), default=None)
+            if first_ns is not None and last_ns is not None:
+                return first_ns, last_ns
         return None
+
+    def _times(self, connections: list[Connection], start_ns: int) -> Iterator[int]:
+        """Yield the times of the messages of some connections from a time on, up to damage."""
+        with suppress(Exception):
+            for _, time_ns, _ in self._reader.messages(connections, start=start_ns):
+                yield time_ns
 
     def _end_ns(self) -> int:
         found = getattr(self._reader, "metadata", self._reader)

@@ -184,6 +184,27 @@ def test_a_damaged_bag_is_refused_or_read_to_its_damage(tmp_path: Path, containe
     assert counted > 0
 
 
+@pytest.mark.parametrize("container", ["mcap", "bag"])
+def test_a_bag_without_its_index_is_read_to_its_end(tmp_path: Path, container: Container) -> None:
+    """A recorder that is killed leaves whole chunks and a part of one; what precedes that part is read."""
+    ros, packets = Ros(container), payloads(568, 400)
+    scans = [ros.scan(SCAN, PACKET, packets[n : n + 100], length=1500, sized=True) for n in range(0, 400, 100)]
+    messages = [("/p", SCAN, START_NS + n * 10**8, scan) for n, scan in enumerate(scans * 20)]
+    whole = write_bag(tmp_path / "bag", container, messages).read_bytes()
+    file = tmp_path / f"killed.{container}.active"
+    for length in (len(whole) // 2, len(whole) // 3):
+        file.write_bytes(whole[:length])
+        tally = CaptureTally()
+        units = by_topic(list(read_bag(file, ["/p"], tally)))["/p"]
+        assert units == (packets * 20)[: len(units)]
+        assert 0.7 * length < 1512 * len(units) < length
+        assert tally.damage == 1
+        assert tally.first_damage.startswith(f"{file}: cannot be read further: ")
+        with open_bag(file) as bag:
+            assert bag.topics["/p"].count * 100 == len(units)
+            assert bag.span_ns("/p") is not None
+
+
 def test_files_that_are_no_bags_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     packed = FIXTURES / "rosbag" / "nebula_vlp16.db3.gz"
     with pytest.raises(TransportError, match="compressed as a whole; unpack it first"):
