@@ -40,6 +40,7 @@ from swath.georef.records import ChunkBatch, PpsEdge, Record
 
 READING_S = 0.1  # between two readings of the host's clocks
 EDGE_BYTES = 100
+STREAMS = ("serial", "tcp", "ntrip")
 QUEUE_BYTES = 64 << 20  # of each wire: raw units and decoded rows that the loop has not taken yet
 
 Told = Callable[[SessionState, str], None]
@@ -212,7 +213,8 @@ class Listening:
             self._add(f"pps/{name}", partial(open_pps, parse_pps(pps.source, pps.edge)), self._edges(f"pps/{name}"))
         for wire, spec, decoders in self._wires():
             self.specs[wire] = spec
-            self._add(wire, partial(open_transport, spec, self._ending.is_set), self._units(wire, decoders))
+            decode = self._units(wire, decoders, stream=spec.kind in STREAMS)
+            self._add(wire, partial(open_transport, spec, self._ending.is_set), decode)
 
     def _wires(self) -> Iterator[tuple[str, TransportSpec, list[Decoder]]]:
         """Yield the wires with the decoders that read them."""
@@ -235,8 +237,10 @@ class Listening:
 
     # ------------------------------------------------------------------ in the wires' threads
 
-    def _units(self, wire: str, decoders: Sequence[Decoder]) -> Callable[[list[UnitBlock], bool], Measured[Batch]]:
-        """Return the function that decodes a wire's blocks."""
+    def _units(
+        self, wire: str, decoders: Sequence[Decoder], *, stream: bool
+    ) -> Callable[[list[UnitBlock], bool], Measured[Batch]]:
+        """Return the function that decodes a wire's blocks; one reading of a ``stream`` may hold bytes of seconds."""
         stamps, senders = StampConverter(self.clock), self.senders.setdefault(wire, Senders())
 
         def decode(blocks: list[UnitBlock], late: bool) -> Measured[Batch]:
@@ -248,13 +252,12 @@ class Listening:
             for at, block in zip(times, blocks, strict=True):
                 if block.peer is not None and len(at):
                     senders.add(block.peer[0], int(at[0]), int(at[-1]), len(at))
-            doubtful = late and any(block.kernel_realtime_ns is None for block in blocks)
             batch = Batch(wire, units, {})
             for decoder in decoders:
                 source = decoder.entry.source
                 timed = None
                 if self._clocks is not None:
-                    timed = partial(self._clocks.take, source, late=doubtful)
+                    timed = partial(self._clocks.take, source, late=late and stream)
                 batch.records[source], batch.times[source] = decoder.feed(units, timed)
             return batch.measured
 
