@@ -123,7 +123,7 @@ class BagListing:
     def text(self) -> str:
         """Return the list, as comments, and the configuration."""
         total = sum(one.topic.count for one in self.topics if not one.topic.name.endswith(SECOND))
-        lines = [f"# {one_line(str(self.path))}: {self.kind} bag, {total} messages of {len(self.topics)} topics"]
+        lines = [f"# {one_line(str(self.path))}: {self.kind} bag, {total} messages of {_topics(len(self.topics))}"]
         if not self.finished:
             lines[0] += "; it has no index, because its recorder was stopped"
         for one in self.topics:
@@ -300,6 +300,10 @@ def _same_head(one: ListedTopic, second: ListedTopic) -> bool:
 def _name(text: str) -> str:
     """Return a text as a name of the configuration."""
     return re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_")[-_MAX_NAME:] or "bag"
+
+
+def _topics(count: int) -> str:
+    return "1 topic" if count == 1 else f"{count} topics"
 
 
 def _utc(time_ns: int) -> str:
