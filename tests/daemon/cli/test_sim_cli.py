@@ -79,7 +79,8 @@ def flown(plan: str, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, st
     folder = tmp_path_factory.mktemp("flown") / "new" / "folder"
     done = swath("sim", "fly", plan, "-o", str(folder), "--seconds", SECONDS)
     assert done.returncode == 0, done.stderr
-    assert done.stderr == ""
+    phases = ("preparing the flight: ", "flying tiny: ", "packing the truth: ")  # printed where all takes over 5 s
+    assert [line for line in done.stderr.splitlines() if not line.startswith(phases)] == []
     return folder, done.stdout
 
 
