@@ -312,6 +312,12 @@ class Aircraft(_Many):
 class Following(_Many):
     """A recorder's log as it grows, as `follow` gives it; an asynchronous context manager, and iterable without it."""
 
+    @property
+    def session_id(self) -> str:
+        """Name of the recording that is read now; empty before the first."""
+        name: str = self._listening.session_id
+        return name
+
     async def __aiter__(self) -> AsyncIterator[Received]:
         """Open the log and yield its records one by one, until the loop is left."""
         async with self:

@@ -315,12 +315,9 @@ class _SessionDecoder:
                 if found is not None:
                     self._clocks.add_edge(source, found)
         elif source is not None:
-            device = source.removesuffix("/aux")
-            self._units[device] += len(batch.units)
-            self._bytes[device] += batch.units.size
             run = self._runs.setdefault(source, Run(partial(self._parse, source)))
             run.add(ChunkBatch(source, batch.log_time_ns, batch.units))
-            if not device.startswith("scanner/"):
+            if not source.startswith("scanner/"):
                 run.flush()
 
     def flush(self) -> None:
@@ -329,7 +326,9 @@ class _SessionDecoder:
             run.flush()
 
     def _parse(self, wire: str, units: list[ChunkBatch]) -> None:
-        batch = Batch(wire, units, {})
+        batch, device = Batch(wire, units, {}), wire.removesuffix("/aux")
+        self._units[device] += sum(len(one.units) for one in units)
+        self._bytes[device] += sum(one.units.size for one in units)
         for source in self._sources.inside(wire.removesuffix("/aux")):
             records = self.parsers[source].feed_batches(units)
             batch.records[source] = records
