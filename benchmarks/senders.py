@@ -2,6 +2,7 @@
 
 python -m benchmarks.senders udp PORT BYTES RATE SECONDS   prints the number sent and the seconds it took
 python -m benchmarks.senders vlp16 PORT FILE RATE SECONDS  the same, with a head's datagram, stamped anew each time
+python -m benchmarks.senders file PORT BYTES FILE RATE SECONDS  the same, with a file of datagrams, again and again
 python -m benchmarks.senders can CHANNEL RATE SECONDS      prints the number sent
 """
 
@@ -59,6 +60,16 @@ def send_vlp16(port: int, datagram: bytes, rate: float, seconds: float) -> tuple
     return _send(port, units, fill, rate, seconds)
 
 
+def send_file(port: int, datagrams: ByteRows, rate: float, seconds: float) -> tuple[int, float]:
+    """Send datagrams (n, length) at a rate, in order and again from the first; return as `send_udp` does."""
+    units = np.empty((_SLOTS, datagrams.shape[1]), np.uint8)
+
+    def fill(first: int, count: int) -> None:
+        units[:count] = datagrams[np.arange(first, first + count) % len(datagrams)]
+
+    return _send(port, units, fill, rate, seconds)
+
+
 def _send(
     port: int, units: ByteRows, fill: Callable[[int, int], None], rate: float, seconds: float
 ) -> tuple[int, float]:
@@ -109,6 +120,9 @@ def main() -> None:
         print(*send_udp(int(rest[0]), int(rest[1]), float(rest[2]), float(rest[3])))
     elif kind == "vlp16":
         print(*send_vlp16(int(rest[0]), Path(rest[1]).read_bytes(), float(rest[2]), float(rest[3])))
+    elif kind == "file":
+        datagrams = np.fromfile(rest[2], np.uint8).reshape(-1, int(rest[1]))
+        print(*send_file(int(rest[0]), datagrams, float(rest[3]), float(rest[4])))
     else:
         print(send_can(rest[0], float(rest[1]), float(rest[2])))
 
