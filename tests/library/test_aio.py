@@ -225,6 +225,19 @@ async def test_cancelling_a_task_closes_its_wire_at_once() -> None:
         probe.bind(("127.0.0.1", port))
 
 
+async def test_leaving_a_loop_leaves_the_rest_of_a_reading_to_the_next() -> None:
+    port, count = free_udp_port(), 100
+    async with swath.aio.open(f"udp:127.0.0.1:{port}?buffer_mb=4", protocol="raw") as device:
+        await asyncio.to_thread(send_all, port, [number.to_bytes(4, "big") for number in range(count)])
+        got: list[int] = []
+        async with asyncio.timeout(LIMIT_S):
+            while len(got) < count:
+                async for _, unit in device.units():
+                    got.append(int.from_bytes(unit, "big"))
+                    break
+    assert got == list(range(count))
+
+
 async def test_two_tasks_cannot_read_one_device() -> None:
     async with swath.aio.open(f"udp:127.0.0.1:{free_udp_port()}", protocol="raw") as device:
         task: asyncio.Future[Any] = asyncio.ensure_future(anext(device.units()))
