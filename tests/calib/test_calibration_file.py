@@ -29,6 +29,7 @@ CREATED = dt.datetime(2026, 11, 21, 10, 15, tzinfo=dt.UTC)
 HEADER = Header("2026-11-21T10:15:00Z-ab12", CREATED, "planes", logs=(("a.mcap", "00ff"),))
 
 REAL = st.floats(-1e3, 1e3, allow_subnormal=False)
+TURN = st.floats(-math.tau, math.tau, allow_subnormal=False)  # more than a whole turn is refused
 ANGLE = st.floats(-math.pi, math.pi, allow_subnormal=False)
 TEXT = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=20).filter(
     lambda text: text.splitlines() == [text]
@@ -56,7 +57,7 @@ def calibrations(draw: st.DrawFn) -> Calibration:
         id="x",
         scanner=draw(TEXT),
         method="nominal",
-        parameters=np.array(draw(st.lists(REAL, min_size=count, max_size=count))),
+        parameters=np.array(draw(st.tuples(*(TURN if name.endswith("_rad") else REAL for name in INDEX)))),
         sigmas=np.where(estimated, random.lognormal(-8.0, 3.0, count), 0.0),
         correlation=np.where(both, correlation, np.eye(count)),
         held_sigmas=np.where(held, random.lognormal(-8.0, 3.0, count), 0.0),

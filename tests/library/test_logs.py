@@ -17,7 +17,7 @@ from swath.daemon.processing.records.tables import KINDS, flat_columns
 from swath.drivers.scanner.beams import beam_points
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.geodesy.quaternions import rotated
-from tests.daemon.short_flight import ARM_B, MARK_AFTER_NS, Flown, S
+from tests.daemon.short_flight import ARM_B, MARK_AFTER_NS, Flown, S, fly_short, two_lines
 from tests.library.builders import fly
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -88,6 +88,16 @@ def test_marks_headings_solutions_and_times_are_tables(log: swath.Log) -> None:
     assert set(times["leap_seconds"].tolist()) == {18, -1}  # -1: of messages in GPS time
     assert set((times["gps_ns"] % S).tolist()) == {0}
     assert rover.status().dtype == KINDS["status"].dtype
+
+
+def test_times_by_guessed_leap_seconds_have_a_sigma_of_a_second(tmp_path: Path) -> None:
+    """NMEA names UTC; in 2040 no table says how GPS time differs from it."""
+    plan = two_lines("guessed", flight='seed = 5\nstart = 2040-06-15T09:00:00Z', gnss='protocol = "nmea"')
+    flown = fly_short(tmp_path, plan, seconds=15.0)
+    fixes = swath.open(flown.folder / "logs")["gnss/rover"].fixes()
+    timed = fixes[fixes["gps_ns"] > 0]
+    assert len(timed) > 10
+    assert (timed["time_sigma_s"] == 1.0).all()
 
 
 def test_a_slice_equals_the_part_of_the_whole(log: swath.Log) -> None:

@@ -25,7 +25,7 @@ from swath.daemon.log.parsers import stored_config
 from swath.daemon.processing.navigation.observations import gps_times
 from swath.daemon.processing.navigation.times import GrowingCounter
 from swath.daemon.processing.points.runs import Run
-from swath.daemon.processing.records.tables import NO_TIME_NS
+from swath.daemon.processing.records.tables import GUESSED_LEAP_S, NO_TIME_NS
 from swath.daemon.processing.setup.sources import Sources
 from swath.drivers.listening import LoopReader, Overflow
 from swath.drivers.parser import DeviceKind
@@ -165,7 +165,7 @@ class LiveClocks:
         """Return the sigma of a time that a record names: 0, the receiver's own, or 1 s if leap seconds are a guess."""
         own = record.sigma_s if isinstance(record, EventMark) and record.sigma_s is not None else 0.0
         if record.time.scale is TimeScale.UTC and source in self._host.by_source:
-            return max(own, 1.0) if self._host.status(source, record.host_time_ns).leap_doubt else own
+            return max(own, GUESSED_LEAP_S) if self._host.status(source, record.host_time_ns).leap_doubt else own
         return float(own)
 
 

@@ -27,7 +27,7 @@ from swath.daemon.processing.navigation.sources import config_of_log, files_of
 from swath.daemon.processing.navigation.times import imu_times
 from swath.daemon.processing.points.clocks import read_clocks
 from swath.daemon.processing.points.runs import Run
-from swath.daemon.processing.records.tables import KINDS, NO_TIME_NS, RecordKind, timed_rows
+from swath.daemon.processing.records.tables import GUESSED_LEAP_S, KINDS, NO_TIME_NS, RecordKind, timed_rows
 from swath.daemon.processing.setup.models import geometry_of
 from swath.daemon.processing.setup.sources import Sources
 from swath.drivers.parser import DeviceKind, Parser, ParserCounters
@@ -39,6 +39,7 @@ from swath.georef.records import (
     InsSolution,
     Record,
     ScannerReturns,
+    TimeScale,
 )
 from swath.georef.scanner.beams import Geometry
 from swath.georef.stream.clocks import FrozenClocks, HostClocks, StreamClocks
@@ -251,6 +252,9 @@ class LogRecords:
         known = np.array([time is not None for time in times], np.bool_)
         table["gps_ns"] = [NO_TIME_NS if time is None else time for time in times]
         table["time_sigma_s"][known & np.isnan(table["time_sigma_s"])] = 0.0
+        if clock is not None and self._host.status(clock, int(table["host_time_ns"][-1])).leap_doubt:
+            utc = np.array([tag is not None and tag.scale is TimeScale.UTC for tag in tags], np.bool_)
+            table["time_sigma_s"][utc & known] = np.fmax(table["time_sigma_s"][utc & known], GUESSED_LEAP_S)
         return table
 
     def _samples(self, source: str, records: list[ImuSamples]) -> StructArray:

@@ -33,6 +33,7 @@ from swath.georef.records import (
 )
 
 NO_TIME_NS = -1
+GUESSED_LEAP_S = 1.0  # sigma of a time in UTC whose leap seconds no receiver has told
 _TIMED: list[Any] = [
     ("gps_ns", "i8"),  # −1: unknown
     ("time_sigma_s", "f8"),  # of gps_ns; 0: the device's own GPS time; nan: unknown

@@ -34,7 +34,7 @@ class Page(HTMLParser):
         self.links: list[str] = []
         self.rows: list[list[str]] = []
         self.words = ""
-        self.feed(text)
+        self.feed(text.replace("\xa0", " "))  # between a number and its unit
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         if tag not in ("meta", "img"):
