@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -53,13 +54,29 @@ def jit_cached(function: Compiled) -> Compiled:
     compiled: Any
     try:
         compiled = _njit(cache=True, **options)(function)
-        index = compiled._cache._cache_file  # noqa: SLF001  (numba has no other way in)
+        _store_if_possible(compiled._cache)  # noqa: SLF001  (numba has no other way in)
+        index = compiled._cache._cache_file  # noqa: SLF001
         stamp = _digest(Path(function.__code__.co_filename).parent)
         index._source_stamp = (index._source_stamp, stamp)  # noqa: SLF001  (nor for its stamp)
     except (RuntimeError, AttributeError):
         compiled = _njit(**options)(function)
     kept_one: Compiled = compiled
     return kept_one
+
+
+def _store_if_possible(cache: Any) -> None:
+    """Let a loop that cannot be stored be compiled again by the next process, instead of ending this one.
+
+    Numba has no machine code to store where another process stored the same loop while this one compiled it; and a
+    disk may be full.
+    """
+    store = cache.save_overload
+
+    def save_overload(signature: Any, data: Any) -> None:
+        with suppress(RuntimeError, OSError):
+            store(signature, data)
+
+    cache.save_overload = save_overload
 
 
 def whole(value: int) -> int:

@@ -71,3 +71,19 @@ def test_a_kernel_is_compiled_without_a_writable_cache_folder(tmp_path: Path) ->
         text=True,
     )
     assert done.stdout.strip() == "4.0", done.stderr
+
+
+def test_a_loop_that_cannot_be_stored_runs_all_the_same(tmp_path: Path) -> None:
+    """Several commands at once compile the same loops on a new installation; numba may then refuse to store one."""
+    script = tmp_path / "kernel.py"
+    script.write_text(
+        "from numba.core.compiler import CompileResult\n"
+        "from swath.georef.compiled import jit_cached\n\n"
+        "def refuse(self):\n    raise RuntimeError('no compiled object yet')\n\n"
+        "CompileResult._reduce = refuse\n\n"
+        "@jit_cached\ndef twice(x):\n    return 2.0 * x\n\n"
+        "print(twice(1.5))\n"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    done = subprocess.run([sys.executable, str(script)], env=environment, capture_output=True, text=True, check=False)
+    assert (done.stdout, done.stderr) == ("3.0\n", "")

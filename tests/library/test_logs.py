@@ -92,7 +92,7 @@ def test_marks_headings_solutions_and_times_are_tables(log: swath.Log) -> None:
 
 def test_times_by_guessed_leap_seconds_have_a_sigma_of_a_second(tmp_path: Path) -> None:
     """NMEA names UTC; in 2040 no table says how GPS time differs from it."""
-    plan = two_lines("guessed", flight='seed = 5\nstart = 2040-06-15T09:00:00Z', gnss='protocol = "nmea"')
+    plan = two_lines("guessed", flight="seed = 5\nstart = 2040-06-15T09:00:00Z", gnss='protocol = "nmea"')
     flown = fly_short(tmp_path, plan, seconds=15.0)
     fixes = swath.open(flown.folder / "logs")["gnss/rover"].fixes()
     timed = fixes[fixes["gps_ns"] > 0]
