@@ -12,6 +12,16 @@ import pytest
 
 TESTS = Path(__file__).parent
 LEAN = TESTS / "lean"
+# Files that take minutes on one worker, longest first: begun last, they would leave the other workers idle.
+LONGEST = (
+    "daemon/cli/test_calibrate_cli.py",
+    "test_office.py",
+    "georef/navigation/test_heading_noise.py",
+    "test_demo.py",
+    "georef/navigation/test_mounting.py",
+    "calib/test_strip_functions.py",
+    "daemon/monitor/test_monitor.py",
+)
 
 
 def prepare_processes() -> None:
@@ -43,8 +53,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Give one worker to tests that share something made once: a fixture of their file, or loops to be compiled.
 
-    `make test` compiles most loops beforehand, and all of calib. The rest is compiled once for georef and once for
-    sim; tests of whole commands find these in the cache, or compile them at the same time.
+    The longest files come first. `make test` compiles most loops beforehand, and all of calib. The rest is compiled
+    once for georef and once for sim; tests of whole commands find these in the cache, or compile them at the same time.
     """
     for item in items:
         marker = item.get_closest_marker("xdist_group")
@@ -54,6 +64,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             package = item.path.relative_to(TESTS).parts[0]
             group = _name(item) if package in ("daemon", "calib") else f"kernels of {package}"
             item.add_marker(pytest.mark.xdist_group(group))
+    items.sort(key=lambda item: LONGEST.index(_name(item)) if _name(item) in LONGEST else len(LONGEST))
 
 
 def _name(item: pytest.Item) -> str:

@@ -100,14 +100,19 @@ def test_bare_install_imports_all_packages_and_no_processing_module(installed: P
     assert (done.returncode, done.stdout.strip()) == (0, "[]"), done.stderr
 
 
+BY_NAME = (  # compiled loops, bags of ROS
+    "swath.drivers.captures.rosbag.bag",
+    "swath.drivers.captures.rosbag.unfinished",
+    "swath.drivers.scanner.rows.compiled",
+)
+
+
 def wants_an_extra(name: str) -> bool:
-    """Return True if a module imports what only an extra brings: compiled loops, virtual aircraft, processing."""
+    """Return True if a module imports what only an extra brings: these, virtual aircraft, processing."""
     _, package, module = [*name.split(".", 2), ""][:3]
     if package == "georef":
         return bool(module) and module.split(".")[0] not in ("records", "timescales")
-    return name == "swath.drivers.scanner.rows.compiled" or name.startswith(
-        ("swath.sim.", "swath.calib.", "swath.daemon.processing.")
-    )
+    return name in BY_NAME or name.startswith(("swath.sim.", "swath.calib.", "swath.daemon.processing."))
 
 
 def test_bare_install_has_every_module_of_the_project(installed: Path) -> None:
