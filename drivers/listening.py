@@ -31,7 +31,7 @@ ItemT = TypeVar("ItemT")
 
 
 class Overflow(StrEnum):
-    """What happens to a wire whose results the reader does not take in time."""
+    """Says what a wire does with results that the reader does not take in time: it waits, or drops the oldest."""
 
     WAIT = "wait"
     DROP = "drop"
@@ -55,7 +55,7 @@ class Measured(Generic[ItemT]):
 
 @dataclass(slots=True)
 class _Lane(Generic[ItemT]):
-    """What waits from one wire: items with the number of their arrival, oldest first."""
+    """Holds the items of one wire that wait for the reader, with the number of their arrival, oldest first."""
 
     items: deque[tuple[int, Measured[ItemT]]] = field(default_factory=deque)
     size_bytes: int = 0
@@ -72,7 +72,7 @@ class _Lane(Generic[ItemT]):
 
 
 class Backlog(Generic[ItemT]):
-    """What several threads have put and one reader has not taken yet; bounded for each wire.
+    """Holds the items that several threads have put and one reader has not taken yet; bounded for each wire.
 
     Args:
         limit_bytes: memory that the items of a wire may hold; a single larger item finds room in an empty lane.

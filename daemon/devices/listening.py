@@ -78,7 +78,7 @@ class Clocks(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """What came in one reading of a wire.
+    """Holds the units and records of one reading of a wire.
 
     Attributes:
         wire: ``scanner/left``, or ``scanner/left/aux`` for a second port.

@@ -92,7 +92,7 @@ class ListedTopic:
 
 @dataclass(slots=True)
 class BagListing:
-    """What is in a bag.
+    """Lists the topics of a bag.
 
     Attributes:
         path, kind: of the bag; "ROS 1" or "ROS 2".

@@ -34,7 +34,7 @@ def _expects(port: Port, topic: BagTopic) -> bool:
 
 @dataclass(slots=True)
 class _Chosen:
-    """What the user wants of one bag.
+    """Names the topics of a bag that become sources.
 
     Attributes:
         topics: all topics of the bag, by name.

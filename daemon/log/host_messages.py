@@ -3,13 +3,48 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from typing import Any
+from collections.abc import Callable, Iterator
+from typing import Any, Protocol
 
+from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch, json_objects
 from swath.georef.records import PpsEdge
 
 MAX_NS = 1 << 62  # limit for the clock values of a foreign log, in either direction
+
+
+class TakesHostMessages(Protocol):
+    """Clocks that are fed with the recorder's own messages: `swath.georef.stream.clocks.HostClocks`."""
+
+    def add_reading(
+        self, realtime_ns: int, monotonic_ns: int, monotonic_raw_ns: int, max_error_s: float = math.inf, /
+    ) -> None:
+        """Take the host's clocks read side by side."""
+
+    def add_edge(self, source: str, edge: PpsEdge, /) -> None:
+        """Take an edge of ``pps/name``."""
+
+
+def feed_clocks(batch: LogBatch, clocks: TakesHostMessages, edge_of: Callable[[str], str | None]) -> bool:
+    """Feed clocks with messages of ``/clock`` and ``/pps/<name>``; return False for those of any other topic.
+
+    Args:
+        batch: messages of one topic.
+        clocks: take the readings and edges.
+        edge_of: returns the wanted polarity of a source's edges; None: no such source is configured.
+    """
+    if batch.channel.topic == "/clock":
+        for reading in readings_of(batch):
+            clocks.add_reading(*reading)
+        return True
+    source = source_of_topic(batch.channel.topic) or ""
+    if not source.startswith("pps/"):
+        return False
+    polarity = edge_of(source)
+    for edge in edges_of(batch, polarity) if polarity is not None else ():
+        if edge is not None:
+            clocks.add_edge(source, edge)
+    return True
 
 
 def readings_of(batch: LogBatch) -> Iterator[tuple[int, int, int, float]]:

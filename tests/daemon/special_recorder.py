@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 from typing import NoReturn
+from unittest.mock import patch
 
 from swath.daemon.config import load_config
 from swath.daemon.log.account import Account
@@ -31,9 +32,9 @@ def main(kind: str, config: Path) -> int:
         def statuses(self: Account, common: dict[str, object]) -> dict[str, dict[str, object]]:
             return whole(self, common) if time.monotonic() < _started_s + 3.0 else _defect()
 
-        Account.statuses = statuses  # type: ignore[method-assign, assignment]
+        patch.object(Account, "statuses", statuses).start()
     elif kind == "broken-receiver":
-        StampConverter.stamp = _defect  # type: ignore[method-assign, assignment]
+        patch.object(StampConverter, "stamp", _defect).start()
     return int(record(load_config(config), queue_bytes=SMALL_QUEUE_BYTES if kind == "small-queue" else QUEUE_BYTES))
 
 

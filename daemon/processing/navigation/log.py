@@ -10,7 +10,7 @@ import numpy as np
 
 from swath.daemon.log.chunk_index import SCANNER, Listening
 from swath.daemon.log.format import source_of_topic
-from swath.daemon.log.host_messages import edges_of, readings_of
+from swath.daemon.log.host_messages import feed_clocks
 from swath.daemon.log.reader import Session
 from swath.daemon.processing.undecoded import refused_by
 from swath.drivers.parser import PacketParser
@@ -81,19 +81,10 @@ class _Reader:
 
     def take(self, batch: LogBatch) -> None:
         """Take the next messages."""
-        topic, host = batch.channel.topic, self.found.host
-        if topic == "/clock":
-            for reading in readings_of(batch):
-                host.add_reading(*reading)
+        if feed_clocks(batch, self.found.host, self._sources.edge_of):
             return
-        source = source_of_topic(topic)
+        source = source_of_topic(batch.channel.topic)
         if source is None:
-            return
-        if source.startswith("pps/"):
-            edge = self._sources.edge_of(source)
-            edges = edges_of(batch, edge) if edge is not None else ()
-            for found in filter(None, edges):
-                host.add_edge(source, found)
             return
         for name in self._sources.inside(source):
             if name in self._parsers:

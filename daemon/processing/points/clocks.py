@@ -13,7 +13,7 @@ import numpy as np
 
 from swath.daemon.log.chunk_index import SCANNER
 from swath.daemon.log.format import source_of_topic
-from swath.daemon.log.host_messages import edges_of, readings_of
+from swath.daemon.log.host_messages import feed_clocks
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.reader import Session
 from swath.daemon.processing.points.runs import Run
@@ -80,17 +80,10 @@ class _ClockReader:
 
     def take(self, batch: LogBatch) -> None:
         """Take the next messages."""
-        topic = batch.channel.topic
-        source = source_of_topic(topic)
-        if topic == "/clock":
-            for reading in readings_of(batch):
-                self.host.add_reading(*reading)
-        elif source is not None and source.startswith("pps/"):
-            edge = self._sources.edge_of(source)
-            for found in edges_of(batch, edge) if edge is not None else ():
-                if found is not None:
-                    self.host.add_edge(source, found)
-        elif source is not None:  # only the source's own order matters: times are settled all at once
+        if feed_clocks(batch, self.host, self._sources.edge_of):
+            return
+        source = source_of_topic(batch.channel.topic)
+        if source is not None:  # only the source's own order matters: times are settled all at once
             run = self._runs.setdefault(source, Run(partial(self._parse, self._sources.inside(source))))
             run.add(ChunkBatch(source, batch.log_time_ns, batch.units))
 

@@ -30,7 +30,7 @@ Columns = dict[str, NDArray[Any]]
 
 @dataclass(slots=True)
 class RecordFiles:
-    """What was written.
+    """Lists the files that were written.
 
     Attributes:
         folder: the session's folder.

@@ -19,7 +19,7 @@ from swath.daemon.devices.listening import QUEUE_BYTES, Batch, Status, Times, de
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.follow import LogFollower, PartFollower
 from swath.daemon.log.format import LogError, SessionInfo, source_of_topic
-from swath.daemon.log.host_messages import edges_of, readings_of
+from swath.daemon.log.host_messages import feed_clocks
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.parsers import stored_config
 from swath.daemon.processing.navigation.observations import gps_times
@@ -304,17 +304,10 @@ class _SessionDecoder:
 
     def take(self, batch: LogBatch) -> None:
         """Take messages of one channel."""
-        topic = batch.channel.topic
-        source = source_of_topic(topic)
-        if topic == "/clock":
-            for reading in readings_of(batch):
-                self._clocks.add_reading(*reading)
-        elif source is not None and source.startswith("pps/"):
-            edge = self._sources.edge_of(source)
-            for found in edges_of(batch, edge) if edge is not None else ():
-                if found is not None:
-                    self._clocks.add_edge(source, found)
-        elif source is not None:
+        if feed_clocks(batch, self._clocks, self._sources.edge_of):
+            return
+        source = source_of_topic(batch.channel.topic)
+        if source is not None:
             run = self._runs.setdefault(source, Run(partial(self._parse, source)))
             run.add(ChunkBatch(source, batch.log_time_ns, batch.units))
             if not source.startswith("scanner/"):

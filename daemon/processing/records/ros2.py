@@ -51,7 +51,7 @@ Message = tuple[int, str, str, Any]  # POSIX time of arrival, topic, type, messa
 
 @dataclass(slots=True)
 class RosExport:
-    """What an export to ROS 2 wrote.
+    """Lists the topics that an export to ROS 2 wrote.
 
     Attributes:
         folder: of the bag.

@@ -5,6 +5,7 @@ Messages come in the order of the file. Layouts: https://mcap.dev/spec, http://w
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Collection, Iterator
 from io import BytesIO
@@ -21,7 +22,7 @@ _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinition
 _Found = tuple[int, int, bytes]  # connection, time, message
 
 
-class Unfinished:
+class Unfinished(ABC):
     """A bag without its index, with the methods of the library's readers.
 
     Attributes:
@@ -58,11 +59,12 @@ class Unfinished:
         raise ValueError("its recorder was stopped before it wrote the end")
 
     def close(self) -> None:
-        """Do nothing; each reading opens and closes the file."""
+        """Forget the connections; each reading opens and closes the file itself."""
+        self.connections = []
 
+    @abstractmethod
     def _read(self) -> Iterator[_Found]:
         """Yield messages and note their connections."""
-        raise NotImplementedError
 
 
 class UnfinishedMcap(Unfinished):
