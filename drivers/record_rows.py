@@ -9,9 +9,14 @@ import numpy as np
 
 from swath.georef.records import IMU_DTYPE, INS_DTYPE, ImuSamples, InsSolution, Record
 
+_SENT = [name for name in IMU_DTYPE.names or () if name != "time_sigma_s"]
+_SENT_DTYPE = np.dtype([(name, IMU_DTYPE[name]) for name in _SENT], align=True)
+
 
 class Row(NamedTuple):
-    """One row of an array record, its fields in the order of the record's dtype."""
+    """One row of an array record, its fields in the order of the record's dtype; of samples without ``time_sigma_s``,
+    which is then 0.
+    """
 
     record: type[ImuSamples] | type[InsSolution]
     values: tuple[Any, ...]
@@ -38,5 +43,7 @@ def _array(run: list[Row]) -> Record:
     """Convert rows of one kind to one record."""
     values: list[Any] = [row.values for row in run]
     if run[0].record is ImuSamples:
-        return ImuSamples(np.array(values, dtype=IMU_DTYPE))
+        rows = np.zeros(len(values), IMU_DTYPE)
+        rows[_SENT] = np.array(values, dtype=_SENT_DTYPE)
+        return ImuSamples(rows)
     return InsSolution(np.array(values, dtype=INS_DTYPE))

@@ -204,6 +204,7 @@ IMU_DTYPE = np.dtype(
         ("temperature_c", "f4"),  # nan: not given
         ("status", "u4"),
         ("gps_week", "i4"),  # if device time is GPS time of week; -1: otherwise
+        ("time_sigma_s", "f4"),  # of that GPS time; 0: the device's own clock is set by GNSS
     ],
     align=True,
 )

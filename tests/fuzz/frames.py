@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from swath.drivers import record_frames
 from swath.drivers.framing import kinds as frame_kinds
 from swath.drivers.framing.checksums import crc16_ccitt, crc24q, crc32_novatel, nmea_xor, ubx_fletcher
 from swath.drivers.framing.framer import FrameKind, Framer
@@ -23,7 +24,7 @@ from tests.fuzz.mutation import LARGEST_CASE_BYTES, bounds, damage
 
 KINDS: dict[str, FrameKind] = {
     kind.name: kind
-    for module in (frame_kinds, microstrain, oxts_ncom, sbg_ecom, vectornav)
+    for module in (frame_kinds, microstrain, oxts_ncom, record_frames, sbg_ecom, vectornav)
     for kind in vars(module).values()
     if isinstance(kind, FrameKind)
 }
@@ -143,6 +144,12 @@ def _seal_ncom(frame: bytes) -> bytes:
     return bytes(packet)
 
 
+def _seal_records(frame: bytes) -> bytes:
+    content = bytearray(record_frames.SYNC + frame[4:-4].ljust(12, b"\0")[: record_frames.MAX_BYTES - 8])
+    struct.pack_into("<I", content, 8, len(content) + 4)
+    return bytes(content) + struct.pack("<I", zlib.crc32(content))
+
+
 SEALS: dict[str, Callable[[bytes], bytes]] = {
     "nmea": _seal_nmea,
     "ubx": _seal_ubx,
@@ -159,6 +166,7 @@ SEALS: dict[str, Callable[[bytes], bytes]] = {
     "mip": _seal_mip,
     "sbg-ecom": _seal_sbg_ecom,
     "ncom": _seal_ncom,
+    "records": _seal_records,
 }
 """Length and checksum of a frame made right, whatever is in it; by the name of its kind."""
 

@@ -86,7 +86,8 @@ def imu_times(rows: StructArray, host: HostClocks, clock: str | None, rate_hz: f
         gps_ns = taken["gps_week"].astype(np.int64) * WEEK_NS + taken["device_time_ns"]
         untimed = stretches(rows["host_time_ns"], own, gps_ns, rate_hz, "samples without a GPS week")
         refused = _reasons(no_gps_week=int((~own).sum()))
-        return ImuTimes(taken, gps_ns, np.zeros(len(taken)), own, "gps", refused, untimed)
+        sigma_ns = taken["time_sigma_s"].astype(np.float64) * SECOND_NS
+        return ImuTimes(taken, gps_ns, sigma_ns, own, "gps", refused, untimed)
     if clock is None or not len(rows):
         none = np.zeros(len(rows), np.bool_)
         return ImuTimes(rows[:0], np.empty(0, np.int64), np.empty(0), none, "arrival", _reasons(no_clock=len(rows)))

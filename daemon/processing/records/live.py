@@ -131,7 +131,7 @@ class LiveClocks:
         if isinstance(record, ImuSamples) and (rows["gps_week"] >= 0).any():
             known = rows["gps_week"] >= 0
             own_ns = rows["gps_week"].astype(np.int64) * WEEK_NS + rows["device_time_ns"]
-            return _times(np.where(known, own_ns, NO_TIME_NS), np.where(known, 0.0, math.nan))
+            return _times(np.where(known, own_ns, NO_TIME_NS), np.where(known, rows["time_sigma_s"], math.nan))
         if isinstance(record, DeviceClockSamples) or source not in self._host.plan.devices:
             return self._arrivals(source, rows["host_time_ns"])
         gps_ns, sigma_ns = self._clocks.gps_from_device(source, rows["device_time_ns"], rows["host_time_ns"])

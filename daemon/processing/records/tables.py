@@ -149,7 +149,8 @@ def timed_rows(rows: StructArray) -> StructArray:
     assert rows.dtype.names is not None
     table = _empty(_timed(rows.dtype), rows["host_time_ns"])
     for name in rows.dtype.names:
-        table[name] = rows[name]
+        if name != "time_sigma_s":
+            table[name] = rows[name]
     return table
 
 
