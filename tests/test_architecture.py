@@ -46,7 +46,7 @@ IMPORTED_LATE = {
     "swath.daemon.processing.control.layers": {"shapefile"},  # for shapefiles only
     "swath.daemon.processing.flights.trajectory_choice": {"swath.georef.trajectory.turn_rates"},  # scipy.signal
     "swath.daemon.processing.pages.pdf": {"weasyprint"},
-    "swath.daemon.processing.records.files": {"pyarrow"},
+    "swath.daemon.processing.records.files": {"pyarrow", "swath.daemon.processing.records.mcap"},  # and protobuf
     "swath.daemon.processing.setup.terrain": {"rasterio"},
     # matplotlib
     "swath.daemon.processing.trajectory.summary": {

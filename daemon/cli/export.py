@@ -32,7 +32,7 @@ def command(
     ],
     records: Annotated[
         str | None,
-        typer.Option(metavar="FORMAT", help="Write decoded records with GPS time instead: csv, parquet or npz."),
+        typer.Option(metavar="FORMAT", help="Write decoded records with GPS time instead: csv, parquet, npz or mcap."),
     ] = None,
     source: Annotated[
         list[str] | None,
@@ -53,8 +53,9 @@ def command(
     """Write logs as serial streams (with RTKLIB's time tags), candump logs, pcap files and PPS text.
 
     What these formats cannot hold goes into a small file beside each; with it `swath import` makes the same log again.
-    With --records, the fixes, samples, returns and other records that the drivers decode, as tables; with --ros2, as
-    messages of a bag. Exit code 4 when the log is damaged; everything readable is still written.
+    With --records, the fixes, samples, returns and other records that the drivers decode, as tables, or (mcap) as
+    messages that Foxglove and PlotJuggler show; with --ros2, as messages of a bag. Exit code 4 when the log is damaged;
+    everything readable is still written.
     """
     if records is not None and ros2:
         raise UserError("--records and --ros2 are two exports; choose one of them", ExitCode.USAGE)
@@ -118,7 +119,10 @@ def _export_records(
 ) -> None:
     from swath.daemon.processing.requirements import require_installed
 
-    require_installed("swath export --records")
+    if form == "mcap":
+        require_installed("swath export --records mcap", "foxglove", "google.protobuf")
+    else:
+        require_installed("swath export --records")
     from swath.daemon.cli.progress import progress_bar
     from swath.daemon.free_space import check_space
     from swath.daemon.log.reader import open_logs
@@ -128,7 +132,7 @@ def _export_records(
 
     if form not in FORMATS:
         raise UserError(f'--records: got "{form}", want {", ".join(FORMATS)}', ExitCode.USAGE)
-    if form != "npz":
+    if form in ("csv", "parquet"):
         arrow()
     start_ns, stop_ns = (None if time is None else _gps_ns(time) for time in times)
     passed_over: list[str] = []
@@ -165,7 +169,7 @@ def _export_records(
 def _print_records(written: RecordFiles) -> None:
     print(one_line(str(written.folder)))
     for name, count in written.rows.items():
-        print(f"  {name}: {count:,} rows")
+        print(one_line(f"  {name}: {count:,} {'messages' if name.startswith('/') else 'rows'}"))
     for note in written.notes:
         print(one_line(f"  note: {note}"))
 

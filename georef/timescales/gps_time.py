@@ -6,6 +6,7 @@ GPS time is int64 nanoseconds since 1980-01-06T00:00:00, continuous (FORMULAS 12
 from __future__ import annotations
 
 import datetime as dt
+import functools
 from bisect import bisect_right
 
 import numpy as np
@@ -84,6 +85,19 @@ def gps_ns_from_datetime(moment: dt.datetime) -> int:
 def unix_ns_from_gps(gps_ns: int, leap_seconds: int) -> int:
     """Return POSIX ns of a GPS time."""
     return gps_ns + GPS_EPOCH_UNIX_S * SECOND_NS - leap_seconds * SECOND_NS
+
+
+def unix_from_gps(gps_ns: int) -> int:
+    """Return POSIX ns of a GPS time for time stamps shown to people; leap seconds are from the built-in table."""
+    second, rest_ns = divmod(gps_ns, SECOND_NS)
+    return _unix_of_second(second) + rest_ns
+
+
+@functools.lru_cache(maxsize=16)
+def _unix_of_second(gps_s: int) -> int:
+    gps_ns = gps_s * SECOND_NS
+    date: dt.date = utc_from_gps(gps_ns, 18)[0]
+    return max(0, unix_ns_from_gps(gps_ns, table_leap_seconds(date)[0]))
 
 
 def utc_from_gps(gps_ns: int, leap_seconds: int) -> tuple[dt.date, int]:

@@ -1,6 +1,7 @@
 // Reads an MCAP file by its index as Foxglove's viewer does, decodes every message by the schema in the file, and holds
 // its fields against Foxglove's published schema of that name. Prints one JSON object.
 import { McapIndexedReader } from "@mcap/core";
+import { loadDecompressHandlers } from "@mcap/support";
 import { open } from "node:fs/promises";
 import { createRequire } from "node:module";
 import protobuf from "protobufjs";
@@ -19,7 +20,7 @@ const readable = {
 };
 const published = new Map(Object.values(foxgloveMessageSchemas).map((schema) => [`foxglove.${schema.name}`, schema]));
 const plain = { longs: String, bytes: String, defaults: true };
-const mcap = await McapIndexedReader.Initialize({ readable });
+const mcap = await McapIndexedReader.Initialize({ readable, decompressHandlers: await loadDecompressHandlers() });
 const types = new Map();
 for (const schema of mcap.schemasById.values()) {
   if (schema.encoding !== "protobuf") throw new Error(`${schema.name}: ${schema.encoding}`);

@@ -1,4 +1,4 @@
-"""Tests ``live.mcap`` with the reader of Foxglove's viewer (@mcap/core) and Foxglove's published schemas."""
+"""Tests ``live.mcap`` and exported records with the reader of Foxglove's viewer (@mcap/core) and published schemas."""
 
 from __future__ import annotations
 
@@ -45,11 +45,16 @@ def live(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def read(live: Path) -> dict[str, Any]:
-    """Return what Foxglove's libraries read from the file."""
+    """Return what Foxglove's libraries read from ``live.mcap``."""
+    return read_file(live / "live.mcap")
+
+
+def read_file(path: Path) -> dict[str, Any]:
+    """Return what Foxglove's libraries read from a file."""
     node = shutil.which("node")
     assert node, "there is no node: apt-get install nodejs npm"
     assert (HERE / "node_modules/@mcap/core").is_dir(), f"no @mcap/core: npm install --prefix {HERE}"
-    command = [node, str(HERE / "read_with_foxglove.mjs"), str(live / "live.mcap")]
+    command = [node, str(HERE / "read_with_foxglove.mjs"), str(path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     found: dict[str, Any] = json.loads(done.stdout)
@@ -85,3 +90,20 @@ def test_a_cloud_lies_below_the_aircraft_in_the_local_frame(read: dict[str, Any]
     assert -90.0 < fix["latitude"] < 90.0
     assert fix["latitude"] != 0.0
     assert metadata["origin"]
+
+
+def test_exported_records_are_read(live: Path, tmp_path: Path) -> None:
+    """Foxglove's own schemas are its published ones; a row of a table has the schema in the file, with all fields."""
+    swath("export", live.parent / "flight", tmp_path, "--records", "mcap")
+    [path] = tmp_path.glob("*/*.mcap")
+    with path.open("rb") as file:
+        written = Counter(channel.topic for _, channel, _ in make_reader(file).iter_messages())
+    topics = read_file(path)["topics"]
+    assert {topic: found["messages"] for topic, found in topics.items()} == written
+    schemas = {topic: found["schema"] for topic, found in topics.items()}
+    assert {name for name in schemas.values() if name.startswith("foxglove.")} == {*SCHEMAS.values(), "foxglove.Log"}
+    for topic, found in topics.items():
+        assert found["fields"] == found["published"] or schemas[topic].startswith("swath."), topic
+    sample = topics["/imu/main/samples"]["first"]
+    assert -12.0 < sample["specific_force_z_mps2"] < -7.0
+    assert int(sample["gps_ns"]) > 1_400_000_000_000_000_000

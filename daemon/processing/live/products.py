@@ -5,8 +5,6 @@ Counts and grids use every point; only live.mcap is thinned. Nothing here affect
 
 from __future__ import annotations
 
-import datetime as dt
-import functools
 import json
 import math
 import os
@@ -28,7 +26,7 @@ from swath.georef.arrays import ByteArray, Int64Array
 from swath.georef.compiled import jit_cached
 from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.points import Points
-from swath.georef.timescales.gps_time import SECOND_NS, table_leap_seconds, unix_ns_from_gps, utc_from_gps
+from swath.georef.timescales.gps_time import SECOND_NS, unix_from_gps
 from swath.georef.trajectory.trajectory import Trajectory
 
 POSE_NS = 100_000_000  # between two poses
@@ -247,21 +245,6 @@ class LiveProducts:
                 mcap.close()
             except OSError as error:
                 self.trouble = f"{NAME}: {error.strerror or error}: the file has no index"
-
-
-def unix_from_gps(gps_ns: int) -> int:
-    """Return POSIX nanoseconds of a GPS time for time stamps shown to people; leap seconds are from
-    the built-in table.
-    """
-    second, rest_ns = divmod(gps_ns, SECOND_NS)
-    return _unix_of_second(second) + rest_ns
-
-
-@functools.lru_cache(maxsize=16)
-def _unix_of_second(gps_s: int) -> int:
-    gps_ns = gps_s * SECOND_NS
-    date: dt.date = utc_from_gps(gps_ns, 18)[0]
-    return max(0, unix_ns_from_gps(gps_ns, table_leap_seconds(date)[0]))
 
 
 def replace_file(path: Path, data: bytes) -> None:

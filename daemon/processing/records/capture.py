@@ -14,6 +14,7 @@ from swath.daemon.config.config import Config
 from swath.daemon.config.load import validate
 from swath.daemon.errors import UserError
 from swath.daemon.processing.points.runs import Run
+from swath.daemon.processing.records.places import places_s
 from swath.daemon.processing.records.tables import timed_rows
 from swath.daemon.processing.setup.models import geometry_of
 from swath.drivers.captures.base import CaptureTally
@@ -21,17 +22,10 @@ from swath.drivers.captures.opening import read_pcap
 from swath.drivers.driver import find_driver
 from swath.drivers.parser import Parser
 from swath.georef.arrays import FloatArray, StructArray
-from swath.georef.points import Fate
-from swath.georef.records import AIMED_RETURN_DTYPE, RETURN_DTYPE, ChunkBatch, Record, ScannerReturns
-from swath.georef.scanner.beams import Geometry
-from swath.georef.scanner.calibration import nominal
-from swath.georef.scanner.sensor_model import SensorModel
-from swath.georef.trajectory.trajectory import Trajectory
+from swath.georef.records import ChunkBatch, Record, ScannerReturns
 
 NAME = "head"
 SOURCE = f"scanner/{NAME}"
-_STILL_NS = np.array([0, 2], np.int64)
-_AT_E = np.array([6_378_137.0, 0.0, 0.0])  # any place on the earth, for a body that does not turn
 _ANY_WIRE = "udp:0.0.0.0:2368"  # what a table needs; nothing is opened
 
 
@@ -121,32 +115,3 @@ def _tables(records: list[Record]) -> Iterator[StructArray]:
     tables = [timed_rows(record.rows) for record in records if isinstance(record, ScannerReturns) and len(record.rows)]
     records.clear()
     yield from tables
-
-
-def places_s(
-    rows: StructArray, geometry: Geometry, range_gate_m: tuple[float, float]
-) -> tuple[FloatArray, StructArray]:
-    """Return the places (m, 3) of returns in the scanner's frame s, m, and the m rows that have one.
-
-    Args:
-        rows: (n,) table of returns.
-        geometry: of the head's beams.
-        range_gate_m: smallest and largest range that is a return.
-    """
-    unsaid = np.full((2, 3), np.nan)
-    still = Trajectory(
-        _STILL_NS, np.stack([_AT_E] * 2), np.array([[1.0, 0, 0, 0]] * 2), np.zeros((2, 3)), unsaid, unsaid
-    )
-    model = SensorModel(nominal("s", (0.0, 0.0, 0.0), np.eye(3)), geometry, range_gate_m)
-    rays = model.rays(_as_measured(rows), np.ones(len(rows), np.int64), still)
-    placed = rays.fate == Fate.GEOREFERENCED
-    return rays.points_e[placed] - _AT_E, rows[placed]
-
-
-def _as_measured(table: StructArray) -> StructArray:
-    """Return a table's rows without their times."""
-    dtype = AIMED_RETURN_DTYPE if "elevation_rad" in (table.dtype.names or ()) else RETURN_DTYPE
-    rows = np.zeros(len(table), dtype)
-    for name in dtype.names or ():
-        rows[name] = table[name]
-    return rows

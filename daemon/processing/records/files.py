@@ -1,4 +1,4 @@
-"""Writes the records of a log's sources as files of tables: CSV, Parquet, NumPy."""
+"""Writes the records of a log's sources as files of tables: CSV, Parquet, NumPy; or as one MCAP file."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ from swath.drivers.driver import RAW
 from swath.georef.arrays import StructArray
 from swath.georef.progress import Tell, silent
 
-FORMATS = ("csv", "parquet", "npz")
+MCAP = "mcap"
+FORMATS = ("csv", "parquet", "npz", MCAP)
 RETURNS = "returns"
 UNFINISHED = ".part"
 Columns = dict[str, NDArray[Any]]
@@ -34,7 +35,7 @@ class RecordFiles:
 
     Attributes:
         folder: the session's folder.
-        rows: number of rows by file name.
+        rows: number of rows by file name; of MCAP, number of messages by topic.
         notes: remarks, one line each.
     """
 
@@ -73,7 +74,7 @@ def write_records(
     target = safe_attachment_path(directory, records.session.session_id)
     if target.exists() and not overwrite:
         raise UserError(f"{target}: already exists; choose another folder or use --overwrite", ExitCode.USAGE)
-    if target.exists() and any(one.is_dir() or one.suffix[1:] not in FORMATS for one in target.iterdir()):
+    if target.exists() and not all(_is_ours(one, target.name) for one in target.iterdir()):
         raise UserError(f"{target}: holds other files than records; choose another folder", ExitCode.USAGE)
     make_folder(directory)
     unfinished = target.with_name(target.name + UNFINISHED)
@@ -81,10 +82,9 @@ def write_records(
     unfinished.mkdir()
     written = RecordFiles(target)
     chosen = [name for name in records.sources if not sources or name in sources]
+    span = (start_ns, stop_ns)
     try:
-        for number, source in enumerate(chosen):
-            tell("records", number, len(chosen), "sources")
-            _write_source(records, source, unfinished, form, (start_ns, stop_ns), written)
+        _write_all(records, _decoded(records, chosen, written.notes), unfinished, form, span, written, tell)
         sync_tree(unfinished)
         shutil.rmtree(target, ignore_errors=True)
         unfinished.rename(target)
@@ -94,6 +94,46 @@ def write_records(
         raise
     try_sync_directory(directory)
     return written
+
+
+def _is_ours(path: Path, session_id: str) -> bool:
+    """Return True for a file of records; a log's own parts, which are MCAP too, are none."""
+    if path.is_dir() or path.suffix == ".mcap":
+        return path.is_file() and path.name == f"{session_id}.mcap"
+    return path.suffix[1:] in FORMATS
+
+
+def _decoded(records: LogRecords, sources: Sequence[str], notes: list[str]) -> list[str]:
+    """Return the sources that a driver reads; ``notes`` gets a line about each other one."""
+    unread = [source for source in sources if records.protocol(source) == RAW]
+    notes += [f"{source}: no driver reads it; swath export without --records writes its bytes" for source in unread]
+    return [source for source in sources if source not in unread]
+
+
+def _write_all(
+    records: LogRecords,
+    sources: Sequence[str],
+    folder: Path,
+    form: str,
+    span: tuple[int | None, int | None],
+    written: RecordFiles,
+    tell: Tell,
+) -> None:
+    """Write the files of all sources."""
+    if form == MCAP:
+        from swath.daemon.processing.records.mcap import write_mcap
+
+        path = folder / f"{written.folder.name}.mcap"
+        written.rows.update(sorted(write_mcap(records, path, sources, span, written.notes, tell).items()))
+    else:
+        for number, source in enumerate(sources):
+            tell("records", number, len(sources), "sources")
+            _write_source(records, source, folder, form, span, written)
+    for source in sources:
+        counters = records.counters.get(source)
+        if counters is not None and counters.errors:
+            refused = ", ".join(f"{count:,} {code}" for code, count in counters.errors.most_common(5))
+            written.notes.append(f"{source}: not decoded: {refused}")
 
 
 def _refuse_unknown(records: LogRecords, sources: Sequence[str]) -> None:
@@ -112,9 +152,6 @@ def _write_source(
     written: RecordFiles,
 ) -> None:
     """Write all tables of a source that have rows."""
-    if records.protocol(source) == RAW:
-        written.notes.append(f"{source}: no driver reads it; swath export without --records writes its bytes")
-        return
     stem = source.replace("/", "-")
     tables = records.tables(source, [name for name in KINDS if name != RETURNS], *span)
     pieces: dict[str, Iterator[StructArray]] = {name: iter([table]) for name, table in tables.items() if len(table)}
@@ -125,10 +162,6 @@ def _write_source(
         count = _write(path, form, map(_columns, rows))
         if count:
             written.rows[path.name] = count
-    counters = records.counters.get(source)
-    if counters is not None and counters.errors:
-        refused = ", ".join(f"{count:,} {code}" for code, count in counters.errors.most_common(5))
-        written.notes.append(f"{source}: not decoded: {refused}")
 
 
 def _columns(table: StructArray) -> Columns:

@@ -19,7 +19,7 @@ from swath.daemon.config.tables import ImuConfig
 from swath.daemon.errors import UserError
 from swath.daemon.log.chunk_index import LogIndex, index_log, read_chunks
 from swath.daemon.log.format import source_of_topic
-from swath.daemon.log.mcap.chunks import LogBatch
+from swath.daemon.log.mcap.chunks import LogBatch, json_objects
 from swath.daemon.log.reader import PartDamage, Session
 from swath.daemon.processing.head_clocks import find_stamps
 from swath.daemon.processing.navigation.observations import gps_times
@@ -43,7 +43,7 @@ from swath.georef.records import (
 )
 from swath.georef.scanner.beams import Geometry
 from swath.georef.stream.clocks import FrozenClocks, HostClocks, StreamClocks
-from swath.georef.timescales import SECOND_NS
+from swath.georef.timescales import SECOND_NS, unix_from_gps
 
 MARGIN_NS = 5 * SECOND_NS  # messages before a slice that belong to its epochs, and edges that a scanner latched
 IMU_MARGIN_NS = 60 * SECOND_NS  # over which the counter of an IMU without a latch is compared with arrivals
@@ -118,12 +118,17 @@ class LogRecords:
         clock = self._clock()
         if clock is None:
             raise UserError(f"{self.session.parts[0].path}: no GPS time is known in this log; leave start and stop out")
-        first = min((place.start_ns for place in self._index.chunks), default=0)
+        first = self.begin_host_ns
         found = [
             edge if given is None else self._host_from_gps(clock, given, first)
             for given, edge in ((start_ns, EVER[0]), (stop_ns, EVER[1]))
         ]
         return found[0], found[1]
+
+    @property
+    def begin_host_ns(self) -> int:
+        """The host's time of the log's first message, ns; 0: it has none."""
+        return min((place.start_ns for place in self._index.chunks), default=0)
 
     def _clock(self) -> str | None:
         """Return the source whose clock gives the host's time; None: no clock has locked."""
@@ -146,9 +151,36 @@ class LogRecords:
         clock = self._clock()
         if clock is None:
             return None
-        ends = [min(p.start_ns for p in self._index.chunks), max(p.end_ns for p in self._index.chunks)]
+        ends = [self.begin_host_ns, max(p.end_ns for p in self._index.chunks)]
         first, last = self._host.gps_from_host(clock, np.array(ends, np.int64))[0].tolist()
         return first, last
+
+    @cached_property
+    def _host_late_ns(self) -> int:
+        """POSIX time less the host's, at the log's end; 0 without a clock."""
+        clock = self._clock()
+        if clock is None:
+            return 0
+        end_ns = self._index.chunks[-1].end_ns
+        gps_ns, _sigma = self._host.gps_from_host(clock, np.array([end_ns], np.int64))
+        return unix_from_gps(int(gps_ns[0])) - end_ns
+
+    def posix_of_host(self, host_ns: int) -> int:
+        """Return the POSIX time of a time of the host's clock, ns, corrected where the log knows GPS time."""
+        return host_ns + self._host_late_ns
+
+    def posix_ns(self, table: StructArray) -> Int64Array:
+        """Return the POSIX times (n,) of a table's rows, ns, by their GPS times and the built-in table of leap seconds.
+
+        Of rows without a GPS time by the host's clock, corrected where the log knows GPS time.
+        """
+        gps_ns: Int64Array = table["gps_ns"]
+        times: Int64Array = table["host_time_ns"] + self._host_late_ns
+        known = np.flatnonzero(gps_ns >= 0)
+        if len(known):  # leap seconds are those of the first
+            first = int(gps_ns[known[0]])
+            times[known] = gps_ns[known] + (unix_from_gps(first) - first)
+        return times
 
     # ------------------------------------------------------------------ reading
 
@@ -172,6 +204,16 @@ class LogRecords:
                 found.clear()
         run.flush()
         yield [*found, *parser.close()]
+
+    def events(self) -> Iterator[dict[str, Any]]:
+        """Yield the recorder's events, in order."""
+        places = [place for place in self._index.chunks if place.other]
+        for batch in read_chunks(self._index, places, lambda topic: topic == "/events", self.damage):
+            yield from (event for _, event in json_objects(batch))
+
+    def in_body(self, source: str, rows: StructArray) -> StructArray:
+        """Return a source's solutions with the attitude of the body instead of the IMU's own axes."""
+        return self._sources.ins_rows(rows, source)
 
     def geometry(self, source: str) -> Geometry:
         """Return the geometry of a scanner's beams.
@@ -240,6 +282,8 @@ class LogRecords:
         if kind.record is ImuSamples:
             return self._samples(source, records)
         table = kind.table(records)
+        if not len(table):
+            return table
         if kind.record is InsSolution:
             table["time_sigma_s"][table["gps_ns"] >= 0] = 0.0
             return table

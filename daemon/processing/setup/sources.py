@@ -223,9 +223,11 @@ class Sources:
         ]
         return shown[0] if shown else None
 
-    def ins_rows(self, rows: StructArray) -> StructArray:
-        """Return the INS's solutions with the attitude of b instead of the IMU's own axes (``rotation_b_imu``)."""
-        rot_b_from_imu = self._rotation_b_imu(self.ins_source)
+    def ins_rows(self, rows: StructArray, source: str | None = None) -> StructArray:
+        """Return the solutions of an INS, that of georeferencing or ``source``, with the attitude of b instead of the
+        IMU's own axes (``rotation_b_imu``).
+        """
+        rot_b_from_imu = self._rotation_b_imu(source or self.ins_source)
         if np.array_equal(rot_b_from_imu, np.eye(3)):
             return rows
         turned = rows.copy()

@@ -12,6 +12,8 @@ import pyarrow.parquet
 import pytest
 
 import swath as library
+from swath.daemon.processing.records.read import LogRecords
+from swath.daemon.processing.records.tables import KINDS
 from tests.daemon.commands import swath
 from tests.daemon.short_flight import Flown
 from tests.library.builders import fly
@@ -77,7 +79,7 @@ def test_a_source_and_a_slice_can_be_chosen(flown: Flown, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (("--records", "xls"), '--records: got "xls", want csv, parquet, npz'),
+        (("--records", "xls"), '--records: got "xls", want csv, parquet, npz, mcap'),
         (
             ("--records", "csv", "--source", "imu/left"),
             "has no source imu/left; it has: gnss/rover, imu/main, scanner/left",
@@ -107,3 +109,9 @@ def test_an_export_is_replaced_only_when_asked(flown: Flown, tmp_path: Path) -> 
     assert {path.name.partition("_")[0] for path in folder.iterdir()} == {"gnss-rover"}
     (folder / "notes.txt").write_text("mine")
     assert "holds other files than records" in swath(*again, "--overwrite").stderr
+
+
+def test_a_receiver_may_lack_a_kind_of_records(flown: Flown) -> None:
+    """Its clock was asked for the state at the last of no records."""
+    records = LogRecords.of_session(flown.session())
+    assert len(records._placed("gnss/rover", KINDS["headings"], [])) == 0
