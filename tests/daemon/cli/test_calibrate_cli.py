@@ -7,8 +7,10 @@ import math
 import re
 import sys
 from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -21,12 +23,17 @@ from swath.calib.planes.fit import PlaneSettings
 from swath.calib.planes.search import find_planes
 from swath.daemon.cli.main import run_app
 from swath.daemon.errors import ExitCode, UserError
+from swath.daemon.log.reader import Session
 from swath.daemon.processing.calibration import run as calibrate_run
 from swath.daemon.processing.calibration.model import model_of
 from swath.daemon.processing.calibration.plan.run import PlanOptions, plan_calibration
+from swath.daemon.processing.calibration.returns import KeptFlight, read_flight
 from swath.daemon.processing.calibration.run import refuse_no_planes
+from swath.daemon.processing.flights.read import Check, GeorefOptions
+from swath.daemon.processing.setup.setup import Setup
 from swath.daemon.processing.warm_up import warm_calibration
 from swath.georef.mapping.frame import Mapping
+from swath.georef.progress import Tell
 from swath.georef.scanner.calibration import Calibration, read_calibration
 from swath.sim.plan.plan import parse_plan
 from tests.calib.village import KNOWN, Made, judge_unusable, village
@@ -58,8 +65,38 @@ def loops() -> set[str]:
     return {f"{one.py_func.__qualname__} {types}" for one in known for types in one.overloads}
 
 
+Read = Callable[[GeorefOptions, Path, Tell, Check], KeptFlight]
+
+
 @pytest.fixture(scope="module")
-def products(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def read_once(tmp_path_factory: pytest.TempPathFactory) -> Read:
+    """Return a reading that reads the log of each trajectory once, which takes most of a command's time."""
+    known: dict[Path | None, tuple[KeptFlight, Sequence[Session], Sequence[Setup]]] = {}
+
+    def read(request: GeorefOptions, folder: Path, tell: Tell, check: Check) -> KeptFlight:
+        key, opened = request.trajectory.file, []
+
+        def noting(sessions: Sequence[Session], setups: Sequence[Setup]) -> None:
+            opened.append((sessions, setups))
+            check(sessions, setups)
+
+        if key in known:
+            check(*known[key][1:])
+        else:
+            known[key] = read_flight(request, tmp_path_factory.mktemp("returns"), tell, noting), *opened[0]
+        return known[key][0]
+
+    return read
+
+
+@pytest.fixture
+def read_already(read_once: Read, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give commands what an earlier one read of their log."""
+    monkeypatch.setattr(calibrate_run, "read_flight", read_once)
+
+
+@pytest.fixture(scope="module")
+def products(made: Made, read_once: Read, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the products of one run, and in ``new_loops`` the loops that a warm-up does not compile."""
     folder = tmp_path_factory.mktemp("products")
     control = made.flown.folder / "control.csv"
@@ -77,7 +114,8 @@ def products(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
     given[given.index(str(made.flown.log))] = str(logs)
     summary = Path(given[given.index("--trajectory") + 1]).with_suffix(".json")
     summary.write_text('{"format": "swath.trajectory", "solution": "smoothed", "sessions": []}')
-    assert run_app(given) == 0
+    with patch.object(calibrate_run, "read_flight", read_once):
+        assert run_app(given) == 0
     (folder / "new_loops").write_text("\n".join(sorted(loops() - warm)))
     return folder
 
@@ -219,6 +257,7 @@ def test_calibration_of_a_navigated_flight_matches_the_sigmas_of_the_plan(
         assert 0.75 < predicted / sigma < 1.25, name
 
 
+@pytest.mark.usefixtures("read_already")
 def test_control_outside_the_points_is_refused(made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two points are too few for the software to doubt their coordinates as a whole."""
     lines = (made.flown.folder / "control.csv").read_text().splitlines()
@@ -249,6 +288,7 @@ def picked(made: Made, path: Path) -> Path:
     return path
 
 
+@pytest.mark.usefixtures("read_already")
 def test_points_picked_before_the_calibration_fit_after_it(
     made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -278,7 +318,7 @@ def test_an_unusable_trajectory_makes_the_calibration_unusable(
     file, output = tmp_path / "flight.csv", tmp_path / "left.toml"
     file.write_bytes((made.flown.folder / "true_trajectory.csv").read_bytes())
     judge_unusable(file, "the lever arm has another sign")
-    given = arguments(made, output)
+    given = arguments(made, output, *first_strips(made, 3, tmp_path))
     given[given.index("--trajectory") + 1] = str(file)
     assert run_app(given) == 1
     told = capsys.readouterr()
@@ -298,6 +338,7 @@ def test_one_strip_is_refused(made: Made, tmp_path: Path, capsys: pytest.Capture
     assert "1 strip" in line
 
 
+@pytest.mark.usefixtures("read_already")
 def test_heights_above_the_geoid_are_refused(made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lines = (made.flown.folder / "control.csv").read_text().splitlines()
     lowered = [lines[0]]
@@ -319,7 +360,7 @@ IBRC = (("intensity", [500.0, 2000.0]), ("correction_m", [0.025, -0.05]))
 def by_intensity(tmp_path_factory: pytest.TempPathFactory) -> Made:
     table = "\n".join(f"{key} = {values}" for key, values in IBRC)
     folder, more = tmp_path_factory.mktemp("by_intensity"), f"[scanner.left.ibrc]\n{table}\n"
-    return village(folder, prf_hz=20_000.0, lines=(0, 1, 2, 3, 4), plan_more=more)
+    return village(folder, prf_hz=10_000.0, lines=(0, 1, 2, 3, 4), plan_more=more)
 
 
 def asked(made: Made, folder: Path, capsys: pytest.CaptureFixture[str], model: str) -> tuple[Any, Calibration]:
@@ -331,6 +372,7 @@ def asked(made: Made, folder: Path, capsys: pytest.CaptureFixture[str], model: s
     return json.loads(capsys.readouterr().out), read_calibration(output.read_text(), "left.toml")
 
 
+@pytest.mark.usefixtures("read_already")
 def test_a_model_file_can_request_the_correction_by_intensity(
     by_intensity: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -357,6 +399,7 @@ def test_a_model_file_can_request_the_correction_by_intensity(
     assert "model.toml" in [one["name"] for one in told["inputs"]]
 
 
+@pytest.mark.usefixtures("read_already")
 def test_undetermined_tables_of_a_model_are_held_and_reported(
     by_intensity: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -440,6 +483,7 @@ def test_strips_without_common_planes_are_refused_with_the_reason() -> None:
         refuse_no_planes("log", Features(refused=Counter({"curved": 2, "too rough": 7})))
 
 
+@pytest.mark.usefixtures("read_already")
 def test_a_calibration_too_far_from_the_start_is_refused(
     made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
