@@ -114,21 +114,19 @@ def test_scripts_named_like_the_packages_do_not_shadow_them(tmp_path: Path) -> N
     place.run("python", "-c", "import swath.calib.adjust, swath.georef.georeference", folder=folder)
 
 
-@pytest.mark.parametrize("options", [(), ("--editable",)])
-def test_pages_find_their_templates(tmp_path: Path, options: tuple[str, ...]) -> None:
-    place = Place(tmp_path)
-    place.install_swath(*options)
-    assert place.run("python", "-c", RENDER) == "1 1\n"
-
-
 def test_an_editable_installation_works_over_the_remains_of_an_ordinary_one(tmp_path: Path) -> None:
-    """pip leaves the caches of compiled loops, and with them the folders that they are in."""
+    """pip leaves the caches of compiled loops, and with them the folders that they are in.
+
+    Pages find their templates in either installation.
+    """
     place = Place(tmp_path)
     place.install_swath()
+    assert place.run("python", "-c", RENDER) == "1 1\n"
     assert place.run("python", "-c", COMPILE) == f"{place.packages / 'swath/__init__.py'}\n"
     caches = place.packages / "swath/georef/air/__pycache__"
     assert list(caches.glob("*.nbi"))
     place.install_swath("--editable")
     assert list(caches.glob("*.nbi")), "the caches are gone: nothing is shown"
     assert place.run("python", "-c", COMPILE) == f"{place.sources / 'swath/__init__.py'}\n"
+    assert place.run("python", "-c", RENDER) == "1 1\n"
     assert len(json.loads(place.run("swath", "devices", "--json"))["devices"]) > 10
