@@ -44,11 +44,13 @@ test-peers: $(VENV)/.tests ## run the tests against gpsd and Foxglove's reader, 
 
 test-vm: $(VENV)/.tests ## run the tests of CAN, PPS, systemd and power cuts in a virtual machine, which it installs (root, apt, alone)
 	@bash tests/vm/setup.sh
-	$(PYTEST) -n 0 -v -m "not long" tests/vm
+	$(PYTEST) -n 2 --dist loadfile -v -m "not alone and not long" tests/vm
+	$(call PYTEST,-alone) -n 0 -v -m "alone and not long" tests/vm
 
 test-vm-long: $(VENV)/.tests ## run the same with 50 power cuts and three minutes of flight
 	@bash tests/vm/setup.sh
-	$(PYTEST) -n 0 -v tests/vm
+	$(PYTEST) -n 2 --dist loadfile -v -m "not alone" tests/vm
+	$(call PYTEST,-alone) -n 0 -v -m alone tests/vm
 
 test-arm64: $(VENV)/.tests ## compare decoders, log and points with an emulated ARM64, which it installs (root, apt)
 	@bash tests/arm64/setup.sh $(VENV)

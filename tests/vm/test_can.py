@@ -15,6 +15,8 @@ from tests.vm.aboard_can import BUS_OFF, CONTROLLER, ERROR, RESTARTED, sample_fr
 from tests.vm.crew import aboard, facts
 from tests.vm.machine import MODULES
 
+pytestmark = pytest.mark.alone
+
 CLOCKS_NS = 50_000  # REALTIME and MONOTONIC are read one after the other, and only a change beyond this is a step
 KVASER = ["-object", "can-bus,id=bus", *["-device", "kvaser_pci,canbus=bus"] * 2]
 

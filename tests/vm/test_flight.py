@@ -37,6 +37,8 @@ from tests.daemon.rig import HANGS_S, wait_until
 from tests.vm import aircraft, machine
 from tests.vm.installed import with_udev
 
+pytestmark = pytest.mark.alone
+
 PRF_HZ = 2000  # an emulated machine can follow this rate; the other flights of this kind have 1000
 SECONDS, SECONDS_LONG = 60.0, 180.0
 BITRATE = 460_800

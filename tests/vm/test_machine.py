@@ -10,6 +10,8 @@ import pytest
 
 from tests.vm import machine
 
+pytestmark = pytest.mark.alone
+
 PAUSED_AT_FIRST = """\
 #!/bin/sh
 mkdir {mark} 2>/dev/null && exec {qemu} -S "$@"

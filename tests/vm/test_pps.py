@@ -15,6 +15,8 @@ from tests.vm.crew import GnssReceiver, aboard, embark, facts
 from tests.vm.machine import DCD_SHIM, MODULES, Machine
 from tests.vm.seconds import labelled, states_between, wrong_seconds
 
+pytestmark = pytest.mark.alone
+
 
 def test_pps_seconds_are_never_wrong_whatever_happens_to_the_edges(tmp_path: Path) -> None:
     aboard(tmp_path, "aboard_time", "edges", MODULES / "pps_sim.ko", seconds=90)
