@@ -71,7 +71,7 @@ def plan_of(
     more: str = "",
     grade: str = "tactical",
     kind: str = "oscillating",
-    prf_hz: float = 100_000.0,
+    prf_hz: float = 50_000.0,
 ) -> str:
     text = HEAD.format(grade=grade, kind=kind, prf_hz=prf_hz) + more
     for name, (x0, y0), (x1, y1), height in lines:
@@ -168,7 +168,11 @@ def test_parameters_of_a_model_file_are_predicted_and_its_tables_are_not(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A held heading may be wrong by a degree, which blurs roll; tables are reported as not predicted."""
-    plan, picture, model = plan_of(tmp_path, more=VILLAGE), tmp_path / "plan.png", tmp_path / "model.toml"
+    plan, picture, model = (
+        plan_of(tmp_path, more=VILLAGE, prf_hz=100_000.0),
+        tmp_path / "plan.png",
+        tmp_path / "model.toml",
+    )
     model.write_text(
         f'{KNOWN}kappa_deg = "fixed"\nphi_deg = {{ prior = 0.0001 }}\n'
         "[ibrc]\nknots = [100, 1000]\n[range_offset]\nreturn_slots = [1, 2]\n"
