@@ -410,7 +410,7 @@ def follow(
 
 def _listening(config: Config, overflow: str, queue_mb: float, *, times: bool) -> Listening:
     make_clocks = partial(_clocks, config) if times else None
-    return Listening(config, make_clocks=make_clocks, **_queue(overflow, queue_mb))
+    return Listening(config.devices(), config.pps, make_clocks=make_clocks, **_queue(overflow, queue_mb))
 
 
 def _queue(overflow: str, queue_mb: float) -> dict[str, Any]:

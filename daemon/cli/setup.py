@@ -63,7 +63,7 @@ def _apply(wires: list[WireSetup], timeout_s: float) -> None:
     from swath.daemon.devices.setup import apply_setup
 
     for wire in wires:
-        with Console(stderr=True).status(f"setting up {wire.spec.text}"):
+        with Console(stderr=True).status(f"setting up {wire.device.transport.text}"):
             apply_setup(wire, timeout_s)
 
 

@@ -144,7 +144,7 @@ def check_everything(config: Config, seconds: float) -> list[Report]:
 
 
 async def _check_everything(config: Config, seconds: float) -> list[Report]:
-    listening = Listening(config)
+    listening = Listening(config.devices(), config.pps)
     readings = {source: Reading(decoder) for source, decoder in listening.decoders.items()}
     edges: dict[str, list[RawEdge]] = {f"pps/{name}": [] for name in config.pps}
     reports = {f"pps/{name}": Report(f"pps/{name}", pps.source) for name, pps in config.pps.items()}

@@ -1,4 +1,4 @@
-"""Listens to all devices of a configuration at once, for one task of an asyncio loop.
+"""Listens to several devices at once, for one task of an asyncio loop.
 
 Each wire has a thread (decision 0003) that receives, stamps and decodes; the loop gets whole readings. Both ports of a
 head feed one parser, and a device inside another one's stream reads along on its wire.
@@ -12,14 +12,15 @@ import math
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple, Protocol, Self
 
 import numpy as np
 
-from swath.daemon.config import Config, DeviceEntry
+from swath.daemon.config import DeviceEntry
+from swath.daemon.config.tables import PpsConfig
 from swath.daemon.log.host_clock import (
     HostClock,
     StampConverter,
@@ -173,10 +174,11 @@ def decoded_counts(parser: Parser, records: Mapping[str, int]) -> dict[str, Any]
 
 
 class Listening:
-    """Opens a configuration's wires, and gives a loop what comes; an asynchronous context manager.
+    """Opens devices' wires, and gives a loop what comes; an asynchronous context manager.
 
     Args:
-        config: the configuration.
+        devices: as a configuration has them.
+        pulses: by name.
         overflow: what happens to a wire whose batches are not taken in time.
         queue_bytes: of each wire that may wait.
         make_clocks: makes clocks for the host's clock of this listening; None: records get no GPS times.
@@ -191,14 +193,15 @@ class Listening:
 
     def __init__(
         self,
-        config: Config,
+        devices: Iterable[DeviceEntry],
+        pulses: Mapping[str, PpsConfig],
         *,
         overflow: Overflow = Overflow.WAIT,
         queue_bytes: int = QUEUE_BYTES,
         make_clocks: Callable[[HostClock], Clocks] | None = None,
     ) -> None:
         self.clock = HostClock()
-        self.decoders = {entry.source: Decoder(entry) for entry in config.devices()}
+        self.decoders = {entry.source: Decoder(entry) for entry in devices}
         self.listeners: dict[str, Listener[Any, Batch]] = {}
         self.specs: dict[str, TransportSpec] = {}
         self.senders: dict[str, Senders] = {}
@@ -209,7 +212,7 @@ class Listening:
         self._changed = asyncio.Event()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._reader: LoopReader[Batch] = LoopReader(queue_bytes, overflow)
-        for name, pps in config.pps.items():
+        for name, pps in pulses.items():
             self._add(f"pps/{name}", partial(open_pps, parse_pps(pps.source, pps.edge)), self._edges(f"pps/{name}"))
         for wire, spec, decoders in self._wires():
             self.specs[wire] = spec

@@ -1,25 +1,26 @@
 """Sends the devices the messages they need before a survey, and reads their answer to each.
 
-It sends one message at a time, the next only after the answer to the one before. After a missing answer nothing more is
-sent over that wire, since a late answer would be taken as that to another message.
+It listens as `swath.aio` does, and sends one message at a time, the next only after the answer to the one before. After
+a missing answer nothing more is sent over that wire, since a late answer would be taken as that to another message.
 """
 
 from __future__ import annotations
 
-import time
+import asyncio
+import contextlib
 from collections.abc import Collection, Iterable
-from contextlib import closing
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
-from typing import Any
+from typing import Any, Self
 
 from swath.daemon.config import Config, DeviceEntry
+from swath.daemon.devices.listening import Listening
 from swath.daemon.errors import ExitCode, UserError, one_line
-from swath.drivers.driver import find_driver
+from swath.drivers.driver import RAW, find_driver
 from swath.drivers.startup import Answer, StartupMessage, StartupOptions
 from swath.drivers.transports.base import TransportError
-from swath.drivers.transports.opening import open_transport
 from swath.drivers.transports.spec import TransportSpec
+from swath.georef.records import ChunkBatch
 
 SLICE_S = 0.1
 SETTLE_S = 0.3  # time for a device to change its baud rate
@@ -92,11 +93,11 @@ class WireSetup:
     """One wire and the devices that are set up over it: a receiver and the IMUs inside its stream.
 
     Attributes:
-        spec: the transport.
+        device: whose wire it is.
         present_baud: the device's baud rate before it is set to the configured one; None if it is that one already.
     """
 
-    spec: TransportSpec
+    device: DeviceEntry
     devices: list[DeviceSetup] = field(default_factory=list)
     present_baud: int | None = None
 
@@ -107,19 +108,51 @@ class WireSetup:
 
 
 class Line:
-    """An open wire, for one message at a time and its answer.
+    """A wire that `Listening` keeps open, for one message at a time and its answer; an asynchronous context manager.
 
     Args:
-        spec: the transport.
+        device: whose wire it is; its bytes are not decoded.
         baud: its baud rate at first; None uses the configured one.
     """
 
-    def __init__(self, spec: TransportSpec, baud: int | None) -> None:
-        self._spec = spec
-        self._transport = open_transport(spec if baud is None else _at_baud(spec, baud))
-        self._transport.open()
+    def __init__(self, device: DeviceEntry, baud: int | None) -> None:
+        self._device = replace(device, protocol=RAW, auxiliary=None)
+        self._listening = self._at(baud)
 
-    def ask(self, message: StartupMessage, timeout_s: float) -> Answer | None:
+    def _at(self, baud: int | None) -> Listening:
+        spec = self._device.transport
+        if baud is not None:
+            spec = replace(spec, options={**spec.options, "baud": str(baud)})
+        return Listening([replace(self._device, transport=spec)], {})
+
+    async def __aenter__(self) -> Self:
+        """Open the wire.
+
+        Raises:
+            TransportError: it cannot be opened.
+        """
+        await self._open()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Release the wire."""
+        await self._listening.__aexit__()
+
+    async def _open(self) -> None:
+        await self._listening.__aenter__()
+        try:
+            await self._listening.tried()
+            self._check()
+        except BaseException:
+            await self._listening.__aexit__()
+            raise
+
+    def _check(self) -> None:
+        """Raise `TransportError` if the device has gone; the wire would be opened again, but the device may be new."""
+        if reason := self._listening.listeners[self._device.source].session.last_error:
+            raise TransportError(reason)
+
+    async def ask(self, message: StartupMessage, timeout_s: float) -> Answer | None:
         """Send a message and wait for its answer; return None if there was none.
 
         A message that changes the baud rate is sent again at the new rate, and the second answer counts, since an
@@ -128,30 +161,38 @@ class Line:
         Raises:
             TransportError: the device has gone.
         """
-        answer = self._ask(message, timeout_s)
+        answer = await self._ask(message, timeout_s)
         if message.baud is None or (answer is not None and not answer.accepted):
             return answer
-        self._transport.close()
-        time.sleep(SETTLE_S)
-        self._transport = open_transport(_at_baud(self._spec, message.baud))
-        self._transport.open()
-        return self._ask(message, timeout_s)
+        await self._listening.__aexit__()
+        await asyncio.sleep(SETTLE_S)
+        self._listening = self._at(message.baud)
+        await self._open()
+        return await self._ask(message, timeout_s)
 
-    def _ask(self, message: StartupMessage, timeout_s: float) -> Answer | None:
-        listener = message.listen()
-        self._transport.receive(0.0)  # discards earlier bytes, which are not an answer
-        self._transport.send(message.data)
-        deadline_s = time.monotonic() + timeout_s
-        while (left_s := deadline_s - time.monotonic()) > 0:
-            for block in self._transport.receive(min(SLICE_S, left_s)):
-                answer = listener.hear(block.units.tobytes())
+    async def _ask(self, message: StartupMessage, timeout_s: float) -> Answer | None:
+        listener, loop = message.listen(), asyncio.get_running_loop()
+        asked_ns = self._listening.clock.now_ns()
+        await self._listening.send(self._device.source, message.data)
+        deadline_s = loop.time() + timeout_s
+        while (left_s := deadline_s - loop.time()) > 0:
+            self._check()
+            for units in await self._heard(min(SLICE_S, left_s)):
+                if units.host_time_ns[0] < asked_ns:  # no answer to this message
+                    continue
+                answer = listener.hear(units.units.tobytes())
                 if answer is not None:
                     return answer
         return listener.close()
 
-    def close(self) -> None:
-        """Release the wire."""
-        self._transport.close()
+    async def _heard(self, seconds: float) -> list[ChunkBatch]:
+        """Return the units of the next reading; none: nothing came in so many seconds."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                batch = await self._listening.take()
+            if batch is not None:
+                return batch.units
+        return []
 
 
 def plan_setup(
@@ -175,7 +216,7 @@ def plan_setup(
     for entry in entries.values():
         if not only or entry.source in only:
             carrier = entries[entry.transport.carrier or entry.source]
-            wire = wires.setdefault(carrier.source, WireSetup(carrier.transport))
+            wire = wires.setdefault(carrier.source, WireSetup(carrier))
             _add_device(wire, entry, carrier, StartupOptions(save, present_baud and _configured_baud(carrier)))
     if present_baud is not None:
         _change_rate(wires, present_baud)
@@ -207,7 +248,7 @@ def _add_device(wire: WireSetup, entry: DeviceEntry, carrier: DeviceEntry, optio
         return
     known = {step.message.data for step in wire.steps()}
     device.steps = [Step(message) for message in startup(entry.settings, options) if message.data not in known]
-    device.problem = _why_not_sent(wire.spec)
+    device.problem = _why_not_sent(wire.device.transport)
 
 
 def _why_not_sent(spec: TransportSpec) -> str:
@@ -223,17 +264,12 @@ def _why_not_sent(spec: TransportSpec) -> str:
     return f"{spec.text} cannot send{hint}"
 
 
-def _at_baud(spec: TransportSpec, baud: int) -> TransportSpec:
-    return replace(spec, options={**spec.options, "baud": str(baud)})
-
-
 def apply_setup(wire: WireSetup, timeout_s: float) -> None:
     """Send a wire's messages and keep the devices' answers in its steps."""
     steps = wire.steps()
     if steps and not any(device.problem for device in wire.devices):
         try:
-            with closing(Line(wire.spec, wire.present_baud)) as line:
-                _send_all(line, steps, timeout_s)
+            asyncio.run(_send_all(wire, steps, timeout_s))
         except TransportError as error:
             for device in wire.devices:
                 device.problem = str(error) if device.steps else ""
@@ -242,19 +278,20 @@ def apply_setup(wire: WireSetup, timeout_s: float) -> None:
             step.outcome = Outcome.NOT_SENT
 
 
-def _send_all(line: Line, steps: list[Step], timeout_s: float) -> None:
-    for step in steps:
-        if step.message.last and not _all_accepted(steps):
-            step.outcome, step.answer = Outcome.NOT_SENT, "the device did not accept every message"
-            continue
-        step.outcome = Outcome.NO_ANSWER  # kept if no answer arrives
-        answer = line.ask(step.message, timeout_s)
-        if answer is None:
-            return
-        step.outcome = Outcome.ACCEPTED if answer.accepted else Outcome.REFUSED
-        step.answer = one_line(answer.text)
-        if step.message.baud is not None and not answer.accepted:
-            return
+async def _send_all(wire: WireSetup, steps: list[Step], timeout_s: float) -> None:
+    async with Line(wire.device, wire.present_baud) as line:
+        for step in steps:
+            if step.message.last and not _all_accepted(steps):
+                step.outcome, step.answer = Outcome.NOT_SENT, "the device did not accept every message"
+                continue
+            step.outcome = Outcome.NO_ANSWER  # kept if no answer arrives
+            answer = await line.ask(step.message, timeout_s)
+            if answer is None:
+                return
+            step.outcome = Outcome.ACCEPTED if answer.accepted else Outcome.REFUSED
+            step.answer = one_line(answer.text)
+            if step.message.baud is not None and not answer.accepted:
+                return
 
 
 def _all_accepted(steps: Iterable[Step]) -> bool:

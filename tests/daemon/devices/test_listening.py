@@ -62,7 +62,7 @@ async def test_clocks_learn_what_was_late_by_a_slow_reader(tmp_path: Path) -> No
             f'[gnss.{name}]\ntransport = "{wire}"\nprotocol = "nmea"\n' for name, wire in wires.items()
         )
         config = parse_config(text, tmp_path / "swath.toml")
-        async with Listening(config, queue_bytes=1, make_clocks=lambda _: heard) as listening:
+        async with Listening(config.devices(), config.pps, queue_bytes=1, make_clocks=lambda _: heard) as listening:
             stamp_ns = time.time_ns()
             os.write(edges, f"{stamp_ns} 7\n".encode())
             while heard.least(wires) < 2 or not heard.edges:  # noqa: ASYNC110  (threads do it)
