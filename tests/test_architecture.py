@@ -43,7 +43,6 @@ IMPORTED_LATE = {
         "swath.daemon.processing.calibration.report",
         "swath.daemon.processing.pages",
     },
-    "swath.daemon.processing.control.layers": {"shapefile"},  # for shapefiles only
     "swath.daemon.processing.flights.trajectory_choice": {"swath.georef.trajectory.turn_rates"},  # scipy.signal
     "swath.daemon.processing.pages.pdf": {"weasyprint"},
     "swath.daemon.processing.records.files": {"pyarrow", "swath.daemon.processing.records.mcap"},  # and protobuf
@@ -53,6 +52,7 @@ IMPORTED_LATE = {
         "swath.daemon.processing.pages.pdf",
         "swath.daemon.processing.trajectory.page",
     },
+    "swath.daemon.processing.vector_layers": {"shapefile"},  # for shapefiles only
     "swath.daemon.simulate.plans": {"swath.sim"},  # the only import of the virtual aircraft
     "swath.daemon.system": {"psutil"},
     "swath.drivers.captures.opening": {"swath.drivers.captures.rosbag.bag"},  # rosbags

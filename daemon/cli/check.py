@@ -30,12 +30,14 @@ def command(
     from swath.daemon.config.geometry import drawing, geometry_lines, placed_devices
 
     loaded = load_config(config)
-    findings = [*configuration_findings(loaded), *_crs_findings(loaded)]
+    planned, plan_findings = _planned(loaded)
+    findings = [*configuration_findings(loaded), *_crs_findings(loaded), *plan_findings]
     placed = placed_devices(loaded)
     reports = [] if offline else _listen(loaded, seconds)
     wrong = bool(findings) or not all(report.ok for report in reports)
     if as_json:
         found = {"config": str(config), "ok": not wrong, "findings": findings, "geometry": geometry_lines(placed)}
+        found |= {"plan": planned} if planned else {}
         found |= {"sources": _sources(loaded)} if offline else {"devices": [report.plain() for report in reports]}
         print(json.dumps(found, indent=2))
     else:
@@ -45,6 +47,8 @@ def command(
             print(f"{loaded.path}: valid; {count}: {', '.join(sources) or 'none'}")
         else:
             _print_reports(reports)
+        for line in [planned] if planned else []:
+            print(line)
         for line in [*geometry_lines(placed), *drawing(placed)]:
             print(line)
         _print_findings(findings)
@@ -79,6 +83,29 @@ def _crs_findings(config: Config) -> list[str]:
         except MappingError as error:
             lines.append(f"gnss.{name}: {error}")
     return lines
+
+
+def _planned(config: Config) -> tuple[str, list[str]]:
+    """Return the size of the flight plan in a line, and what is wrong or was assumed; PROJ may be absent."""
+    if config.tables.plan.file is None:
+        return "", []
+    try:
+        from swath.daemon.processing.flightplan.geometry import LineGeometry
+        from swath.daemon.processing.flightplan.plan import PlanError
+        from swath.daemon.processing.flightplan.read import plan_of
+    except ImportError:
+        return "", []
+    try:
+        plan = plan_of(config, {name: data for name, _, data in config.attachments()})
+    except PlanError as error:
+        return "", [f"plan.file: {error}"]
+    if plan is None:
+        return "", []
+    km = float(LineGeometry(plan.lines).length_m.sum()) / 1000.0
+    polygons = len(plan.area)
+    area = {0: "no area", 1: "an area of 1 polygon"}.get(polygons, f"an area of {polygons} polygons")
+    lines = "1 line" if len(plan.lines) == 1 else f"{len(plan.lines)} lines"
+    return f"plan {plan.name}: {lines}, {km:.1f} km, {area}", [f"plan.file: {note}" for note in plan.notes]
 
 
 def _listen(config: Config, seconds: float) -> list[Report]:

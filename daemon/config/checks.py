@@ -41,6 +41,8 @@ NEEDED_PARAMETERS = (
 )
 
 WILDCARD = "0.0.0.0"
+PLAN_SUFFIXES = (".toml", ".kml", ".kmz", ".geojson", ".json", ".gpkg", ".shp")
+MAX_PLAN_BYTES = 16 << 20  # each part of a log holds the plan
 MIN_BASELINE_M = 0.1  # a shorter baseline gives no useful heading
 
 
@@ -50,6 +52,7 @@ def check_devices(config: Config) -> list[str]:
     lines += _check_directory(config)
     lines += _check_pps(config)
     lines += _check_files(config)
+    lines += _check_plan(config)
     for kind, name, table in config.device_tables():
         lines += _check_device(config, kind, name, table)
     lines += _check_wires(config)
@@ -91,6 +94,28 @@ def _check_files(config: Config) -> Iterator[str]:
         problem = _unreadable(config.resolve(config.mta.terrain))
         if problem:
             yield f"mta.terrain: {config.resolve(config.mta.terrain)}: {problem}; give a file or leave it empty"
+
+
+def _check_plan(config: Config) -> Iterator[str]:
+    """Check that the files of the flight plan exist; what they hold is checked where they are used."""
+    plan = config.tables.plan
+    named: dict[str, Path] = {}
+    for key, name in (("plan.file", plan.file), ("plan.area", plan.area)):
+        if name is None:
+            continue
+        path = config.resolve(name)
+        problem = _unreadable(path)
+        if problem:
+            yield f"{key}: {path}: {problem}; give a file, relative to the configuration"
+        elif path.suffix.lower() not in PLAN_SUFFIXES:
+            yield f'{key}: got "{name}", want a file of one of the kinds {", ".join(PLAN_SUFFIXES)}'
+        elif path.stat().st_size > MAX_PLAN_BYTES:
+            size_mb = path.stat().st_size / 1e6
+            yield f"{key}: {path} has {size_mb:.0f} MB; want at most {MAX_PLAN_BYTES / 1e6:.0f} MB, the lines alone"
+        elif named.setdefault(path.name, path) != path:
+            yield f"plan.file and plan.area: two files are named {path.name}; rename one, logs store them by name"
+    if plan.area is not None and plan.file is None:
+        yield "plan.area: needs plan.file, the lines that are to cover it"
 
 
 def _unreadable(path: Path) -> str | None:

@@ -29,6 +29,7 @@ from swath.drivers.transports.spec import TransportSpec, parse_transport
 DeviceTable = GnssConfig | ImuConfig | ScannerConfig | CorrectionsConfig | RawConfig
 FileKey = Literal["dbc", "calibration", "geometry"]
 _PATH_SOURCES = ("fixed", "serial-dcd")  # kinds of PPS source whose path may be relative
+PLAN_BESIDE = (".dbf", ".prj", ".cpg")  # files beside a shapefile that belong to it
 PARSER_FILES: tuple[FileKey, ...] = ("dbc", "geometry")  # files that a parser needs; it does not use the calibration
 
 
@@ -252,14 +253,32 @@ class Config:
                 attachment = attachment_name(key, name, path)
                 if all(attachment != other for other, _, _ in found):
                     found.append((attachment, _media_type(path), path.read_bytes()))
+        for path in self.plan_files():
+            found.append((plan_attachment(path.name), _media_type(path), path.read_bytes()))
+        return found
+
+    def plan_files(self) -> list[Path]:
+        """Return the files of ``[plan]``, each once, with those beside a shapefile that exist."""
+        found: list[Path] = []
+        for name in (self.tables.plan.file, self.tables.plan.area):
+            if name is None:
+                continue
+            path = self.resolve(name)
+            beside = [path.with_suffix(one) for one in (*PLAN_BESIDE, *map(str.upper, PLAN_BESIDE))]
+            shapes = [one for one in beside if one.is_file()] if path.suffix.lower() == ".shp" else []
+            found += [one for one in (path, *shapes) if one not in found]
         return found
 
     def attachment_names(self) -> list[tuple[str, str]]:
-        """Return, for every file that the devices' tables name, its name in a log and its name in the configuration."""
+        """Return, for every file that the tables name, its name in a log and its name in the configuration."""
         return [
             (attachment_name(key, name, self.resolve(named)), named)
             for _, name, table in self.device_tables()
             for key, named in _names_of(table).items()
+        ] + [
+            (plan_attachment(Path(named).name), named)
+            for named in (self.tables.plan.file, self.tables.plan.area)
+            if named is not None
         ]
 
 
@@ -286,6 +305,21 @@ def attachment_name(key: FileKey, device: str, path: Path) -> str:
     return f"{key}/{device}{suffix}"
 
 
+def plan_attachment(name: str) -> str:
+    """Return the name of a file of the flight plan in a log."""
+    return f"plan/{name}"
+
+
 def _media_type(path: Path) -> str:
-    known = {".toml": "application/toml", ".json": "application/json", ".csv": "text/csv"}
+    known = {
+        ".toml": "application/toml",
+        ".json": "application/json",
+        ".csv": "text/csv",
+        ".geojson": "application/geo+json",
+        ".kml": "application/vnd.google-earth.kml+xml",
+        ".kmz": "application/vnd.google-earth.kmz",
+        ".gpkg": "application/geopackage+sqlite3",
+        ".shp": "application/octet-stream",
+        ".dbf": "application/octet-stream",
+    }
     return known.get(path.suffix.lower(), "text/plain")

@@ -472,6 +472,61 @@ class CalibrationConfig(Section):
     wanted: WantedConfig = Field(default_factory=WantedConfig, description="standard deviations to reach")
 
 
+class PlanToleranceConfig(Section):
+    """``[plan.tolerance]``: how far a line may be flown from its plan before it gets a remark."""
+
+    cross_track_m: float = Field(20.0, gt=0.0, le=10_000.0, description="distance to either side of the line")
+    height_m: float = Field(30.0, gt=0.0, le=5_000.0, description="difference from the wanted height")
+    speed_mps: float = Field(5.0, gt=0.0, le=100.0, description="difference from the wanted speed")
+    bank_deg: float = Field(10.0, gt=0.0, le=60.0, description="bank while the laser measures")
+
+
+class PlanWantedConfig(Section):
+    """``[plan.wanted]``: what every line has to reach."""
+
+    speed_mps: float | None = Field(
+        None, gt=0.0, le=300.0, description="speed over the ground, if the plan gives none for the line"
+    )
+    height_above_ground_m: float | None = Field(
+        None, gt=0.0, le=12_000.0, description="height above ground, if the plan gives no height for the line"
+    )
+    density_per_m2: float | None = Field(
+        None, gt=0.0, le=100_000.0, description="first returns on a square metre of the swath"
+    )
+    overlap_percent: float | None = Field(
+        None, ge=0.0, lt=100.0, description="overlap with the neighbouring line's swath, of the narrower of the two"
+    )
+    fix: Literal["auto", "any", "float", "fixed"] = Field(
+        "auto", description="least quality of the receivers' positions; auto: fixed as soon as one was, before that any"
+    )
+
+
+class PlanConfig(Section):
+    """``[plan]``: the flight plan, against which `swath live` judges the lines as they are flown."""
+
+    file: Text | None = Field(
+        None,
+        description="lines, and possibly the area: KML, KMZ, GeoJSON, GeoPackage, shapefile or a plan of swath sim, "
+        "relative to this file",
+    )
+    layer: Text | None = Field(None, description="layer of a GeoPackage; absent: all of them")
+    names: Text | None = Field(
+        None, description="attribute that names the lines; absent: the first usual one, such as name, line or id"
+    )
+    crs: str | None = Field(None, min_length=1, description="CRS of the file's coordinates, if it gives none")
+    heights: Literal["auto", "ellipsoid", "geoid", "ground", "none"] = Field(
+        "auto", description="what its heights count from; none: they are not used; auto: as the format says"
+    )
+    undulation_m: float | None = Field(
+        None, ge=-120.0, le=120.0, description="the geoid's height above the ellipsoid, for heights above sea level"
+    )
+    area: Text | None = Field(None, description="file of the polygons to be covered; absent: those of the plan's file")
+    tolerance: PlanToleranceConfig = Field(
+        default_factory=PlanToleranceConfig, description="limits of a line without remarks"
+    )
+    wanted: PlanWantedConfig = Field(default_factory=PlanWantedConfig, description="what every line has to reach")
+
+
 class LiveConfig(Section):
     """``[live]``: size and density of the files that `swath live` writes beside the log."""
 
@@ -502,4 +557,5 @@ class Tables(Section):
     profile: ProfileConfig = Field(default_factory=ProfileConfig)
     output: OutputConfig = Field(default_factory=OutputConfig)
     calibration: CalibrationConfig = Field(default_factory=CalibrationConfig)
+    plan: PlanConfig = Field(default_factory=PlanConfig)
     live: LiveConfig = Field(default_factory=LiveConfig)

@@ -1,7 +1,6 @@
 """Read control from GeoPackages and shapefiles of points.
 
-A GeoPackage is an SQLite database whose geometries are documented blobs (OGC 12-128r19, 2.1.3); the standard library
-reads it. pyshp reads shapefiles; it is pure Python. GDAL is not needed for either.
+The standard library and pyshp read them; GDAL is not needed for either.
 """
 
 from __future__ import annotations
@@ -14,18 +13,17 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from pyproj import CRS
-from pyproj.exceptions import CRSError
-
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.control.columns import HEIGHTS, WANTED, Column, Role, column_of
 from swath.daemon.processing.control.table import ControlTable, error_of, table_of
-from swath.drivers.extras import how_to_install
+from swath.daemon.processing.vector_layers import (
+    LayerError,
+    code_of,
+    crs_of_srs,
+    geometry_of_blob,
+    shapefile_module,
+)
 
-ENVELOPE_BYTES = {0: 0, 1: 32, 2: 48, 3: 48, 4: 64}
-POINTS = {1: 2, 1001: 3, 2001: 3, 3001: 4, 0x80000001: 3}  # WKB types of points (also of EWKB), ordinates
-HAS_Z = (1001, 3001, 0x80000001)
-UNDEFINED = (-1, 0)  # srs_id of layers without a CRS
 X_Y_Z = ("geometry x", "geometry y", "geometry z")
 
 Feature = tuple[str, Sequence[float], Sequence[object]]  # where, x y and possibly z, attributes
@@ -66,44 +64,18 @@ def _read_geopackage(path: Path, database: sqlite3.Connection) -> ControlTable:
             raise error_of(path, [f"{where}: has no point; save the layer with one point for each feature"])
         features.append((where, point, [value for column, value in enumerate(row) if column != at]))
     del labels[at]
-    return _table(path, labels, features, _crs_of(database, int(srs)), keys)
-
-
-def _crs_of(database: sqlite3.Connection, srs: int) -> str:
-    if srs in UNDEFINED:
-        return ""
-    row = database.execute(
-        "SELECT organization, organization_coordsys_id, definition FROM gpkg_spatial_ref_sys WHERE srs_id = ?", (srs,)
-    ).fetchone()
-    if row is None:
-        return ""
-    organization, code, definition = row
-    return f"EPSG:{code}" if str(organization).upper() == "EPSG" else _code_of(str(definition))
-
-
-def _code_of(wkt: str) -> str:
-    """Return the code of a CRS that is given as WKT; the WKT itself if it has none."""
-    try:
-        code = CRS.from_user_input(wkt).to_epsg()
-    except CRSError:
-        code = None
-    return wkt if code is None else f"EPSG:{code}"
+    return _table(path, labels, features, crs_of_srs(database, int(srs)), keys)
 
 
 def _point_of(blob: object) -> tuple[float, ...] | None:
     """Return the ordinates x, y and, if there is one, z of a GeoPackage's geometry; None if it is not one point."""
-    if not isinstance(blob, bytes) or len(blob) < 8 or blob[:2] != b"GP":
+    try:
+        found = geometry_of_blob(blob)
+    except LayerError:
         return None
-    start = 8 + ENVELOPE_BYTES.get(blob[3] >> 1 & 7, len(blob))
-    if len(blob) < start + 5:
+    if found is None or len(found.points) != 1 or found.lines or found.polygons:
         return None
-    order = "<" if blob[start] == 1 else ">"
-    (kind,) = struct.unpack_from(f"{order}I", blob, start + 1)
-    size = POINTS.get(kind, 0)
-    if not size or len(blob) < start + 5 + 8 * size:
-        return None
-    values: tuple[float, ...] = struct.unpack_from(f"{order}{size}d", blob, start + 5)
-    values = values[: 3 if kind in HAS_Z else 2]
+    values = tuple(found.points[0].tolist())
     return values if all(map(math.isfinite, values[:2])) else None
 
 
@@ -114,11 +86,9 @@ def read_shapefile(path: Path) -> ControlTable:
         UserError: the file cannot be read; ControlError: it does not hold points, or points have mistakes.
     """
     try:
-        import shapefile
-    except ImportError as error:
-        raise UserError(
-            f"{path}: shapefiles need pyshp, which is not installed: {how_to_install('process')}", ExitCode.USAGE
-        ) from error
+        shapefile = shapefile_module(f"{path}: shapefiles")
+    except LayerError as error:
+        raise UserError(str(error), ExitCode.USAGE) from error
     try:
         with shapefile.Reader(str(path), encodingErrors="replace") as reader:
             if reader.shapeType not in (shapefile.POINT, shapefile.POINTZ, shapefile.POINTM):
@@ -131,7 +101,7 @@ def read_shapefile(path: Path) -> ControlTable:
             raise
         raise UserError(f"{path}: cannot be read as a shapefile: {error}", ExitCode.IO) from error
     prj = path.with_suffix(".prj")
-    crs = _code_of(prj.read_text("utf-8", "replace").strip()) if prj.is_file() else ""
+    crs = code_of(prj.read_text("utf-8", "replace").strip()) if prj.is_file() else ""
     return _table(path, labels, features, crs, set())
 
 

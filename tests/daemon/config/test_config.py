@@ -99,6 +99,9 @@ class TestWholeFile:
             "scanner.*.gimbal.stages.source",
             "attitude.xi_arcsec",
             "attitude.eta_arcsec",
+            "plan.file",
+            "plan.layer",
+            "plan.area",
         }
 
     def test_a_session_alone_is_enough_and_has_the_documented_defaults(self, tmp_path: Path) -> None:
