@@ -34,7 +34,7 @@ from swath.daemon.config.tables import Tables
 from swath.daemon.log.format import SessionInfo
 from swath.daemon.processing.compiling import compilations
 from swath.daemon.processing.live.frame import LocalFrame, Maps
-from swath.daemon.processing.live.grid import CountGrid, count_points
+from swath.daemon.processing.live.grid import CellGrid, paint_points
 from swath.daemon.processing.live.products import Thinning
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.drivers.driver import find_driver
@@ -150,7 +150,7 @@ class WarmUp:
 
 def cache_folder() -> Path | None:
     """Return the folder that loops are kept in; None if there is none."""
-    loop: Any = count_points
+    loop: Any = paint_points
     path: str | None = loop.stats.cache_path
     return None if path is None else Path(path)
 
@@ -221,9 +221,10 @@ def _warm_frame(points: Points, trajectory: Trajectory | None, mapping: Maps | N
 
 def _warm_products(points: Points) -> None:
     points = Points.concatenate([points, points])
-    grid = CountGrid(1.0)
-    grid.add(points.points_map - points.points_map[:1] if len(points) else np.zeros((1, 3)))
-    grid.add(np.zeros((1, 3)))
+    grid = CellGrid(1.0)
+    if len(points):
+        grid.add(points, points.points_map[0].copy(), np.ones(3))
+    grid.add(Points.empty(1, with_sigmas=False), np.zeros(3), np.ones(3), places=np.zeros((1, 3)))
     grid.numbers()
     sigmas = points.sigma_map is not None
     middle = points.points_map.mean(axis=0) if len(points) else np.zeros(3)

@@ -55,6 +55,7 @@ class LiveMcap:
 
     Attributes:
         is_full: True if the quota is used up; further messages are not written.
+        beside_bytes: size of other files that count towards the quota.
     """
 
     def __init__(self, folder: Path, quota_bytes: int, metadata: dict[str, str]) -> None:
@@ -64,6 +65,7 @@ class LiveMcap:
             OSError: the file cannot be created.
         """
         self.is_full = False
+        self.beside_bytes = 0
         self._quota_bytes = quota_bytes
         self._previous = folder / PREVIOUS
         path = folder / NAME
@@ -150,7 +152,7 @@ class LiveMcap:
         """Return True if a message would exceed the quota; the previous run's file is deleted first."""
         if self.is_full:
             return True
-        size = self.size + length + 64
+        size = self.size + self.beside_bytes + length + 64
         if size + self._previous_bytes > self._quota_bytes and self._previous_bytes:
             self._previous.unlink(missing_ok=True)
             self._previous_bytes = 0

@@ -8,21 +8,18 @@ from __future__ import annotations
 import json
 import math
 import os
-import struct
-import zlib
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swath.daemon.config.tables import LiveConfig
 from swath.daemon.processing.live.frame import LocalFrame, Maps
-from swath.daemon.processing.live.grid import CountGrid
 from swath.daemon.processing.live.mcap import NAME, LiveMcap, LivePose
-from swath.georef.arrays import ByteArray, Int64Array
+from swath.daemon.processing.live.painting import COVERAGE, LiveMap
+from swath.georef.arrays import Int64Array
 from swath.georef.compiled import jit_cached
 from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.points import Points
@@ -31,12 +28,8 @@ from swath.georef.trajectory.trajectory import Trajectory
 
 POSE_NS = 100_000_000  # between two poses
 ROOM_AGAIN = 1.05  # free space, relative to where writing stopped, at which it begins again
-IMAGE_CELLS = 2048
-COVERAGE, PICTURE = "coverage.json", "coverage.png"
+TILES_SHARE = 0.5  # of the quota: at most this much is for the map's tiles, the rest for live.mcap
 FIRST_STRIDE = 16  # of the thinning, until the points of one second have been counted
-# Points per square metre, and the colour from there on; empty cells are transparent.
-_COLOURS = ((0.0, 0x5A0F1E), (1.0, 0xB0282E), (2.0, 0xE8743B), (4.0, 0xF4C95D), (8.0, 0x86B66B), (16.0, 0x2F8C74),
-            (32.0, 0x1F5F8B))  # fmt: skip
 
 
 class Thinning:
@@ -104,6 +97,7 @@ class LiveProducts:
 
     Attributes:
         points: number of points by scanner; ``shown``: written to live.mcap; ``unwritten``: thinned but not written.
+        map: the map of cells, with its tiles.
         trouble: why no files are written, for people; empty: they are.
     """
 
@@ -119,7 +113,7 @@ class LiveProducts:
         self.trouble = ""
         self.room = Room(folder, 2 * reserve_bytes)
         self.frame: LocalFrame | None = None
-        self.grid = CountGrid(live.cell_m)
+        self.map = LiveMap(folder, live.cell_m, int(TILES_SHARE * live.live_quota_mb * 1e6))
         self._folder, self._live, self._mapping, self._about = folder, live, mapping, about
         self._thinning = Thinning(live.points_per_s)
         self._mcap: LiveMcap | None = None
@@ -139,11 +133,7 @@ class LiveProducts:
         self.begin(trajectory)
         if self.frame is None:
             return
-        if self.frame.is_level:
-            self.grid.add(self.frame.of_points(points.points_map))
-        else:
-            east, north, _ = self.frame.origin.tolist()
-            self.grid.add(points.points_map, east, north, float(self.frame.unit_m[0]))
+        self.map.take(points, self.frame)
         keep = self._thinning.keep(points.time_ns)
         count = len(keep)
         if count:
@@ -174,6 +164,18 @@ class LiveProducts:
             trajectory.position_sigma_l[-1],
         )
         self._write(lambda mcap: mcap.add_pose(pose, log_time_ns))
+
+    def save_map(self, latest: dict[str, Any], log_time_ns: int, *, last: bool = False) -> None:
+        """Write the map's changed tiles, at most once a second of log time unless they are the ``last``."""
+        due = self.map.grid.has_changed if last else self.map.is_due(log_time_ns)
+        if due and self._has_space:
+            self.map.save(log_time_ns, self.origin() | latest)
+            if self._mcap is not None:
+                self._mcap.beside_bytes = self.map.file_bytes
+
+    @property
+    def _has_space(self) -> bool:
+        return not self.trouble.startswith("free space")
 
     def look_for_room(self) -> None:
         """Check for free space and stop or resume writing; call once a second."""
@@ -217,23 +219,11 @@ class LiveProducts:
         return entry
 
     def save_coverage(self, latest: dict[str, Any]) -> None:
-        """Replace the coverage grid's numbers and picture, each at once; do nothing if there is no room."""
-        if self.trouble.startswith("free space") or not self.grid.points:
+        """Replace the coverage's numbers and picture, each at once; do nothing if there is no room."""
+        if not self._has_space or not self.map.grid.points:
             return
-        counts, west_m, north_m, cell_m = self.grid.image(IMAGE_CELLS)
-        numbers = self.grid.numbers() | self.origin() | latest
-        numbers["picture"] = {
-            "name": PICTURE,
-            "west_m": west_m,
-            "north_m": north_m,
-            "cell_m": cell_m,
-            "rows": counts.shape[0],
-            "columns": counts.shape[1],
-            "colours_from_points_per_m2": {f"#{colour:06x}": density for density, colour in _COLOURS},
-        }
         try:
-            replace_file(self._folder / PICTURE, picture(counts, cell_m))
-            replace_file(self._folder / COVERAGE, (json.dumps(numbers, indent=2) + "\n").encode())
+            self.map.save_coverage(self.origin() | latest)
         except OSError as error:
             self.trouble = f"{COVERAGE}: {error.strerror or error}: nothing is written any more"
 
@@ -245,29 +235,3 @@ class LiveProducts:
                 mcap.close()
             except OSError as error:
                 self.trouble = f"{NAME}: {error.strerror or error}: the file has no index"
-
-
-def replace_file(path: Path, data: bytes) -> None:
-    """Replace a file's content at once: a reader sees the old or the new one, never a part."""
-    new = path.with_name(path.name + ".new")
-    new.write_bytes(data)
-    new.replace(path)
-
-
-def picture(counts: NDArray[Any], cell_m: float) -> bytes:
-    """Return a PNG (ISO/IEC 15948) of cells (rows, columns), one pixel each, coloured by density;
-    empty ones are clear.
-    """
-    index: ByteArray = np.zeros(counts.shape, dtype=np.uint8)
-    for density, _ in _COLOURS:
-        index += counts >= max(1, math.ceil(density * cell_m**2))
-    rows, columns = index.shape
-    lines = np.zeros((rows, columns + 1), dtype=np.uint8)  # each line begins with the number of its filter: 0
-    lines[:, 1:] = index
-    palette = b"".join(colour.to_bytes(3, "big") for colour in (0, *(colour for _, colour in _COLOURS)))
-    head = struct.pack(">IIBBBBB", columns, rows, 8, 3, 0, 0, 0)
-    pieces = {b"IHDR": head, b"PLTE": palette, b"tRNS": b"\0", b"IDAT": zlib.compress(lines.tobytes(), 1), b"IEND": b""}
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in pieces.items()
-    )

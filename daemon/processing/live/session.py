@@ -118,6 +118,7 @@ class LiveSession:
         if placed:
             self._give(placed, live=live)
         self.products.take_pose(self._path.trajectory, self.now_ns)
+        self.products.save_map({"session_id": self.info.session_id}, self.now_ns)
 
     def host_now_ns(self, *, live: bool) -> int:
         """Return the session's host time; if another computer recorded it, the time of the last message read."""
@@ -136,6 +137,7 @@ class LiveSession:
         """Flush the points that still wait at the log's end, and close the files."""
         self._give(self._feed.close(), live=live)
         self.look_for_room()
+        self.products.save_map({"session_id": self.info.session_id}, self.now_ns, last=True)
         self.products.close()
         if self.points is not None:
             self.points.close()

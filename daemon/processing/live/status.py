@@ -16,7 +16,8 @@ from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.processing.carried_verdict import first_lines
 from swath.daemon.processing.live.follow import BEHIND_NS, LiveFollower
-from swath.daemon.processing.live.products import LiveProducts, replace_file
+from swath.daemon.processing.live.products import LiveProducts
+from swath.daemon.processing.live.tiles import replace_file
 from swath.daemon.processing.points.time_checks import time_trouble
 from swath.daemon.processing.setup.setup import Setup
 from swath.georef.arrays import FloatArray, Int64Array
@@ -140,6 +141,7 @@ class LiveStatus:
             "live_mcap": {"points_written": products.shown, "points_not_written": products.unwritten},
             "free_bytes": products.room.free_bytes,
             "stops_writing_at_bytes": products.room.least_bytes,
+            "tiles": {"sequence": products.map.sequence, "trouble": products.map.trouble},
             "trouble": products.trouble,
         } | products.origin()
         if follower is not None:

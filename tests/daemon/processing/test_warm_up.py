@@ -56,13 +56,14 @@ print(json.dumps({"new": sorted(signatures() - before), "compiled": names, "know
 
 NO_CACHE = """
 import numpy as np
-from swath.daemon.processing.live.grid import CountGrid
+from swath.daemon.processing.live.grid import CellGrid
 from swath.daemon.processing.warm_up import WarmUp, cache_folder
+from tests.daemon.processing.live.builders import points_at
 from tests.drivers.scanner.rows.test_compiled import random_slots, returns_table
 from swath.drivers.scanner.rows.compiled import fill
 
-grid = CountGrid(1.0)
-grid.add(np.zeros((3, 3)))
+grid = CellGrid(1.0)
+grid.add(points_at(np.zeros((3, 3))), np.zeros(3), np.ones(3))
 made = random_slots(1, None, 1)
 print(cache_folder(), grid.points, fill(made, returns_table(made.content.size)) > 500)
 """

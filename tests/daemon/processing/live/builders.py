@@ -11,6 +11,8 @@ import numpy as np
 from mcap.reader import make_reader
 from pyproj import CRS, Transformer
 
+from swath.daemon.processing.live.grid import CellGrid
+from swath.daemon.processing.live.tiles import Layers, TileFolder, TileReader
 from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.points import Points
 from swath.georef.timescales.gps_time import SECOND_NS
@@ -188,3 +190,16 @@ def read_back(path: Path) -> dict[str, list[dict[str, Any]]]:
             decoded = Schema(schema.data).decode(f".{schema.name}", message.data)
             found.setdefault(channel.topic, []).append(decoded | {"schema": schema.name, "log_time": message.log_time})
     return found
+
+
+def read_map(folder: Path, grid: CellGrid) -> Layers:
+    """Write a grid's tiles into a folder, and return all of its layers as the reader of tiles gives them."""
+    folder.mkdir(exist_ok=True)
+    TileFolder(folder).write(grid.take_changed(), {"cell_m": grid.cell_m})
+    reader = TileReader(folder)
+    assert reader.refresh()
+    extent = reader.extent_m()
+    assert extent is not None
+    view = reader.view(*extent, grid.cell_m)
+    assert view is not None
+    return view.layers

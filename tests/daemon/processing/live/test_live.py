@@ -297,9 +297,7 @@ class TestStatus:
             fates=lambda name: counts,
             waiting=lambda name: 0,
         )
-        products: Any = SimpleNamespace(
-            points=Counter(), shown=0, unwritten=0, trouble="", room=Mock(), origin=lambda: {}
-        )
+        products: Any = Mock(points=Counter(), origin=lambda: {})
         status = LiveStatus(Mock(), stream, products)
         said = []
         for georeferenced, no_time, past_hour in ((0, 500, 0), (1000, 500, 0), (1900, 600, 0), (1900, 900, 300)):
@@ -317,9 +315,7 @@ class TestStatus:
         stream: Any = SimpleNamespace(
             scanners=[], clocks=SimpleNamespace(host=host), path=SimpleNamespace(covered_until_ns=7)
         )
-        products: Any = SimpleNamespace(
-            points=Counter(), shown=0, unwritten=0, trouble="", room=Mock(), origin=lambda: {}
-        )
+        products: Any = Mock(points=Counter(), origin=lambda: {})
         setup: Any = SimpleNamespace(sources=SimpleNamespace(ins_source="gnss/rover"))
         status = LiveStatus(setup, stream, products)
         assert status.plain(None, 0)["trajectory"] == {"source": "gnss/rover", "covered_until_gps_ns": 7}

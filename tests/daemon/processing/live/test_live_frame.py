@@ -55,7 +55,7 @@ class TestFrame:
             cloud = np.frombuffer(found["/points/left"][0]["data"], np.float32).reshape(-1, 4)
             pose = found["/pose"][0]["pose"]
             values = [pose[part].get(axis, 0.0) for part in ("position", "orientation") for axis in "xyzw"]
-            told.append((products.grid.numbers(), cloud, values, products.origin()["origin_unit_m"]))
+            told.append((products.map.grid.numbers(), cloud, values, products.origin()["origin_unit_m"]))
         assert told[0][0] == told[1][0]
         assert told[0][0]["density_per_m2"]["mean"] == pytest.approx(1.0, abs=0.1)
         np.testing.assert_allclose(told[1][1], told[0][1], rtol=0, atol=1e-3)

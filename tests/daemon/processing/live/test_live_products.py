@@ -13,11 +13,23 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from swath.daemon.config.tables import LiveConfig
-from swath.daemon.processing.live.grid import TILE, CountGrid
+from swath.daemon.processing.live.grid import CellGrid
 from swath.daemon.processing.live.mcap import CLOUD_DTYPE, END_BYTES, NAME, PREVIOUS, LiveMcap
-from swath.daemon.processing.live.products import IMAGE_CELLS, LiveProducts, Room, Thinning, picture
+from swath.daemon.processing.live.painting import HERE, IMAGE_CELLS, METRES, picture
+from swath.daemon.processing.live.products import LiveProducts, Room, Thinning
+from swath.daemon.processing.live.tiles import SIDE
 from swath.georef.timescales.gps_time import SECOND_NS
-from tests.daemon.processing.live.builders import GPS_NS, HEIGHT_M, LAT_DEG, LON_DEG, Utm, flight, points_at, read_back
+from tests.daemon.processing.live.builders import (
+    GPS_NS,
+    HEIGHT_M,
+    LAT_DEG,
+    LON_DEG,
+    Utm,
+    flight,
+    points_at,
+    read_back,
+    read_map,
+)
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -108,7 +120,7 @@ class TestMcap:
         products.take("left", points_at(Utm().map_from_e(trajectory.position_e)), trajectory, SECOND_NS)
         products.save_coverage({})
         products.close()
-        assert (products.points["left"], products.grid.points, products.shown) == (11, 11, 0)
+        assert (products.points["left"], products.map.grid.points, products.shown) == (11, 11, 0)
         assert products.unwritten == 1
         assert list(tmp_path.iterdir()) == []
 
@@ -156,9 +168,9 @@ class TestGrid:
     def test_counts_match_numpy(self) -> None:
         rng = np.random.default_rng(5)
         points = rng.uniform(-700, 900, (50_000, 3))
-        grid = CountGrid(2.5)
+        grid = CellGrid(2.5)
         for piece in np.array_split(points, 7):
-            grid.add(piece)
+            grid.add(points_at(piece), HERE, METRES)
         image, west, north, cell = grid.image(10_000)
         rows, columns = image.shape
         assert cell == 2.5
@@ -175,25 +187,31 @@ class TestGrid:
         assert numbers["density_per_m2"]["mean"] == pytest.approx(covered.mean() / 6.25, abs=1e-3)
         assert numbers["density_per_m2"]["p50"] == pytest.approx(np.median(covered) / 6.25, abs=0.17)
 
-    def test_memory_is_bounded_and_coarser_cells_are_the_sums(self) -> None:
+    def test_memory_is_bounded_and_coarser_cells_are_those_of_a_coarse_grid(self, tmp_path: Path) -> None:
         rng = np.random.default_rng(6)
-        points = rng.uniform(-1000, 3000, (60_000, 3))
-        few, enough = CountGrid(1.0, tiles=16), CountGrid(4.0)
-        few.add(points)
-        enough.add(points)
+        points = rng.uniform(-1000, 1000, (60_000, 3)) * (1.0, 1.0, 0.1)
+        few, enough = CellGrid(1.0, tiles=16), CellGrid(4.0)
+        for grid in (few, enough):
+            for piece in np.array_split(points, 3):
+                grid.add(points_at(piece), HERE, METRES)
         assert few.cell_m == 4.0
         assert few.numbers() == enough.numbers()
-        for limit in (10_000, TILE):
+        for limit in (10_000, SIDE):
             ours, theirs = few.image(limit), enough.image(limit)
             np.testing.assert_array_equal(ours[0], theirs[0])
             assert ours[1:] == theirs[1:]
-            assert max(ours[0].shape) <= max(limit, 2 * TILE)
+            assert max(ours[0].shape) <= max(limit, 2 * SIDE)
             assert ours[0].sum() == len(points)
+        one, other = (read_map(tmp_path / name, grid) for name, grid in (("few", few), ("enough", enough)))
+        for name, values in one.items():
+            within = 0.011 if name.endswith("_m") else 0  # bases differ, and are rounded to centimetres
+            np.testing.assert_allclose(values, other[name], rtol=0, atol=within, err_msg=name)
 
     def test_a_single_distant_point_does_not_enlarge_the_image(self) -> None:
         """A wrong first position would otherwise draw 137 million cells for 6 s, every 10 s."""
-        grid = CountGrid(1.0)
-        grid.add(np.array([[0.5, 0.5, 0.0], [5.5, 5.5, 0.0], [3e6 + 0.5, -3e6 + 0.5, 0.0]]))
+        grid = CellGrid(1.0)
+        points = np.array([[0.5, 0.5, 0.0], [5.5, 5.5, 0.0], [3e6 + 0.5, -3e6 + 0.5, 0.0]])
+        grid.add(points_at(points), HERE, METRES)
         image, west, north, cell = grid.image(IMAGE_CELLS)
         assert max(image.shape) <= IMAGE_CELLS
         assert image.sum() == 3
@@ -201,11 +219,12 @@ class TestGrid:
             assert image[int((north - north_m) // cell), int((east_m - west) // cell)] == count
 
     def test_non_finite_points_are_refused(self) -> None:
-        grid = CountGrid(1.0)
-        grid.add(np.array([[np.nan, 0, 0], [np.inf, 0, 0], [1e30, 0, 0], [0, 0, np.nan], [-0.5, -0.5, 0]]))
-        assert (grid.points, grid.refused) == (5, 3)
-        assert grid.image(100)[0].sum() == 2
-        assert CountGrid(1.0).image(100)[0].size == 0
+        grid = CellGrid(1.0)
+        points = np.array([[np.nan, 0, 0], [np.inf, 0, 0], [1e30, 0, 0], [0, 0, np.nan], [-0.5, -0.5, 0]])
+        grid.add(points_at(points), HERE, METRES)
+        assert (grid.points, grid.refused) == (5, 4)
+        assert grid.image(100)[0].sum() == 1
+        assert CellGrid(1.0).image(100)[0].size == 0
 
 
 class TestPicture:
