@@ -187,6 +187,8 @@ def _print(report: ImportReport, captures: list[Capture]) -> None:
     for capture in captures:
         parts = [f"{count} units of {source}" for source, count in sorted(capture.units.items())] or ["no units"]
         parts += [f"{count} {what} passed over" for what, count in capture.tally.passed.items() if count]
+        if capture.tally.missing_bytes:
+            parts.append(f"{capture.tally.missing_bytes} bytes of TCP not captured")
         if capture.passed:
             most = ", ".join(f"{what} ({count})" for what, count in capture.passed.most_common(5))
             parts.append(f"{capture.passed.total()} from unknown devices: {most}")

@@ -41,12 +41,20 @@ _KIND_OF_PORT = {
     "ntrip": "serial",
     "pps": "pps",
 }
+_FORMS = {
+    "pcap": "a pcap file",
+    "candump": "a log of candump -L",
+    "serial": "a file of serial bytes",
+    "pps": "a file of edges",
+}
 _NO_CAPTURE = {  # first bytes of files that hold device bytes in a format that cannot be imported
     b"\x89MCAP0\r\n": "MCAP, but no ROS 2 bag",
     b"\x28\xb5\x2f\xfd": "compressed with zstd; of a bag give the folder with its metadata.yaml",
     b"LOGG": "a BLF file of Vector",
 }
-_WANTED = "want kind/name=FILE, kind/name:<CAN interface>=FILE, kind/name:<UDP port>=FILE or kind/name:<topic>=BAG"
+_WANTED = (
+    "want kind/name=FILE, kind/name:<CAN interface>=FILE, kind/name:<UDP or TCP port>=FILE or kind/name:<topic>=BAG"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,15 +124,14 @@ def _named(routes: Routes, text: str, bags: BagChoice) -> list[Capture]:
         bags.name(path, port, selector)
         return []
     wanted = _KIND_OF_PORT[port.kind]
-    if (kind == "pcap") != (wanted == "pcap"):
-        forms = {
-            "pcap": "a pcap file",
-            "candump": "a log of candump -L",
-            "serial": "a file of serial bytes",
-            "pps": "a file of edges",
-        }
-        raise UserError(f"{path}: is {forms[kind]}, but {source} uses {port.kind}; want {forms[wanted]}")
-    return [Capture(path, wanted, port, selector or None)]
+    if kind == "pcap" and port.kind == "serial" and not selector:
+        raise UserError(
+            f"{path}: is a pcap file, but {source} uses serial; want a file of serial bytes, or the TCP port that sent "
+            f"them: --source {source}:PORT={path}"
+        )
+    if port.kind == "pps" if kind == "pcap" else port.kind == "udp":
+        raise UserError(f"{path}: is {_FORMS[kind]}, but {source} uses {port.kind}; want {_FORMS[wanted]}")
+    return [Capture(path, "pcap" if kind == "pcap" else wanted, port, selector or None)]
 
 
 def _port(routes: Routes, source: str, where: str) -> Port:
@@ -159,7 +166,8 @@ def _found(routes: Routes, path: Path, bags: BagChoice) -> list[Capture]:
     if kind == "lvx":
         return [_found_heads(routes, path)]
     if routes.described(kind) == "none":
-        raise UserError(f"{path}: the configuration has no {'UDP port' if kind == 'pcap' else 'CAN bus'} for it")
+        what = "UDP or TCP port and no CAN bus" if kind == "pcap" else "CAN bus"
+        raise UserError(f"{path}: the configuration has no {what} for it")
     return [Capture(path, kind)]
 
 

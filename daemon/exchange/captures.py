@@ -6,10 +6,11 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from swath.daemon.exchange.routes import Port, Routes
+from swath.daemon.exchange.routes import STREAMS, Port, Routes
 from swath.daemon.exchange.sidecar import complete, cut_by_sidecar, sidecar_of
 from swath.daemon.log.wires import Senders, mixed_text
 from swath.drivers.captures.base import (
@@ -28,11 +29,13 @@ from swath.drivers.captures.opening import (
     read_bare,
     read_candump,
     read_lvx,
-    read_pcap,
+    read_network,
     read_serial,
     read_tagged,
 )
-from swath.drivers.captures.pcap_writer import NOBODY
+from swath.drivers.captures.pcap.writer import NOBODY
+from swath.drivers.transports.base import SENDERS_SHOWN
+from swath.drivers.transports.ntrip import CasterReply
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,13 +55,13 @@ class Capture:
     Attributes:
         kind: "pcap", "candump", "serial", "lvx", "bag" or "pps".
         port: the port whose units it holds; None if the units identify their ports themselves.
-        selector: the only CAN interface, UDP port number, or head of an lvx file, whose units are used.
+        selector: the only CAN interface, UDP or TCP port number, or head of an lvx file, whose units are used.
         time: timing of the bytes of a serial file without times.
         heads: of an lvx file, by code. head_ports: the ports of those that are used, by code. start_ns: of an lvx file
             whose packages have no UTC, the time at which it begins.
         topics: of a bag, the topics that are read, with their ports.
         units: number used, by source.
-        senders: of its datagrams, by source.
+        senders: of its datagrams, by source. connections: of its streams of TCP, by source.
         passed: number that belong to no device, by port, interface or topic.
     """
 
@@ -76,6 +79,8 @@ class Capture:
     units: Counter[str] = field(default_factory=Counter)
     passed: Counter[str] = field(default_factory=Counter)
     senders: dict[str, Senders] = field(default_factory=dict)
+    connections: dict[str, Senders] = field(default_factory=dict)
+    _replies: dict[tuple[Address, Address], CasterReply] = field(default_factory=dict)
 
     def files(self) -> list[Path]:
         """Return the files of the disk that hold it."""
@@ -83,22 +88,41 @@ class Capture:
 
     def read(self, routes: Routes) -> Iterator[ImportUnit]:
         """Yield the units that belong to a device, in the file's order; damage of the file is noted in ``tally``."""
-        for unit in until_damage(self._captured(), self.tally):
+        for unit in until_damage(self._captured(routes), self.tally):
             if not 0 <= unit.time_ns <= LATEST_NS:
                 self.tally.damaged(f"{self.path}: a unit of {len(unit.data)} bytes has no time between 1970 and 2262")
                 continue
             port = self._port_of(unit, routes)
             if port is None:
                 continue
-            peer = unit.source if unit.source != NOBODY else None
+            data, peer = unit.data, unit.source if unit.source != NOBODY else None
+            if unit.channel == "tcp":
+                data, peer = self._of_connection(unit, port), None
+                if not data:
+                    continue
             self.units[port.source] += 1
             if peer is not None:
                 self.senders.setdefault(port.source, Senders()).add(peer[0], unit.time_ns, unit.time_ns, 1)
-            yield ImportUnit(unit.time_ns, port, unit.data, peer)
+            yield ImportUnit(unit.time_ns, port, data, peer)
 
-    def _captured(self) -> Iterator[CapturedUnit]:
+    def _of_connection(self, unit: CapturedUnit, port: Port) -> bytes:
+        """Return the device's bytes of a segment; of a caster's, what follows the head of its reply."""
+        assert unit.source is not None
+        assert unit.destination is not None
+        name = "{}:{} to {}:{}".format(*unit.source, *unit.destination)
+        self.connections.setdefault(port.source, Senders()).add(name, unit.time_ns, unit.time_ns, 1)
+        if port.kind != "ntrip":
+            return unit.data
+        reply = self._replies.setdefault((unit.source, unit.destination), CasterReply())
+        data = reply.feed(unit.data)
+        if reply.wrong:
+            self.tally.damaged(f"{self.path}: {name}: {reply.wrong}")
+        return data
+
+    def _captured(self, routes: Routes) -> Iterator[CapturedUnit]:
         if self.kind == "pcap":
-            units = read_pcap(self.path, tally=self.tally, drop_copies=not self.keep_copies)
+            wanted = partial(self._wants_stream, routes)
+            units = read_network(self.path, wanted, self.tally, drop_copies=not self.keep_copies)
             return complete(units, self.path)
         if self.kind == "bag":
             return read_bag(self.path, list(self.topics), self.tally)
@@ -119,27 +143,65 @@ class Capture:
         return read_bare(self.path, self.time, self.tally)
 
     def _port_of(self, unit: CapturedUnit, routes: Routes) -> Port | None:
-        if self.port is not None and self.selector is None and self.kind != "lvx":
-            return self.port
         if self.kind == "bag":
             return self.topics.get(unit.channel)
-        destination = str(unit.destination[1]) if unit.destination is not None else unit.channel
+        if self.kind == "pcap":
+            return self._port_of_packet(unit, routes)
         if self.kind == "lvx":
             found = self.head_ports.get(unit.channel)
         elif self.port is not None:
-            found = self.port if destination == self.selector else None
+            found = self.port if self.selector in (None, unit.channel) else None
         else:
-            found = routes.of_datagram(unit) if self.kind == "pcap" else routes.of_frame(unit)
+            found = routes.of_frame(unit)
         if found is None:
-            self.passed[f"port {destination}" if unit.destination is not None else destination] += 1
+            self.passed[unit.channel] += 1
         return found
 
+    def _port_of_packet(self, unit: CapturedUnit, routes: Routes) -> Port | None:
+        """Return the port of a datagram, of a segment of TCP or of a CAN frame of a network capture."""
+        if unit.destination is None or unit.source is None:
+            wire, name = "can", unit.channel
+            found = routes.of_frame(unit) if self.port is None else self.port
+        elif unit.channel == "udp":
+            wire, name = "udp", str(unit.destination[1])
+            found = routes.of_datagram(unit) if self.port is None else self.port
+        else:
+            wire, name = "tcp", str(unit.source[1])
+            found = self._port_of_stream(routes, unit.source)
+        if found is not None and self.port is not None and wire != "tcp":
+            found = found if found.kind == wire and self.selector in (None, name) else None
+        if found is None:
+            service = (
+                str(min(unit.source[1], unit.destination[1]))
+                if wire == "tcp" and unit.source and unit.destination
+                else name
+            )
+            self.passed[{"udp": f"port {name}", "tcp": f"TCP port {service}", "can": name or "a CAN bus"}[wire]] += 1
+        return found
+
+    def _port_of_stream(self, routes: Routes, source: Address) -> Port | None:
+        """Return the port that a stream of TCP from an address belongs to."""
+        if self.port is None:
+            return routes.of_stream(source)
+        number = self.selector or str(self.port.tcp_port)
+        return self.port if self.port.kind in STREAMS and number == str(source[1]) else None
+
+    def _wants_stream(self, routes: Routes, source: Address, destination: Address) -> bool:
+        return self._port_of_stream(routes, source) is not None
+
     def mixed(self) -> list[str]:
-        """Return a line for each source to which several devices send."""
-        return [
+        """Return a line for each source to which several devices or connections send."""
+        several = [
             f"{self.path}: {source}: {mixed_text(senders.counts, recorded=False)}"
             for source, senders in sorted(self.senders.items())
             if senders.mixed and not source.startswith("raw/")
+        ]
+        return several + [
+            f"{self.path}: {source}: {len(one.counts)} connections at the same time are read as one stream: "
+            f"{', '.join(name for name, _ in one.counts.most_common(SENDERS_SHOWN))}; "
+            "keep one of them with `tcpdump -r FILE -w ONE port NUMBER`"
+            for source, one in sorted(self.connections.items())
+            if one.mixed
         ]
 
     def plain(self) -> dict[str, Any]:
@@ -152,6 +214,7 @@ class Capture:
             "heads": [_plain_head(head) for head in self.heads.values()],
             "mixed_senders": {name: dict(one.counts) for name, one in self.senders.items() if one.mixed},
             "passed_over": {what: count for what, count in self.tally.passed.items() if count},
+            "missing_bytes": self.tally.missing_bytes,
             "damage": self.tally.damage,
             "first_damage": self.tally.first_damage or None,
         }

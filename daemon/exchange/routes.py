@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from ipaddress import ip_address
 
 from swath.daemon.config import Config
 from swath.daemon.log.format import ChannelSpec
 from swath.daemon.log.wires import Wire, make_wire
-from swath.drivers.captures.base import CapturedUnit
+from swath.drivers.captures.base import Address, CapturedUnit
 from swath.drivers.captures.opening import LvxHead
 from swath.drivers.transports.spec import TransportSpec
+
+STREAMS = ("serial", "tcp", "ntrip")  # kinds of ports whose units are bytes in sequence
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +22,7 @@ class Port:
 
     Attributes:
         source: ``kind/name``, with ``/aux`` for a second port.
-        kind: "serial", "can", "udp" or "pps".
+        kind: "serial", "tcp", "ntrip", "can", "udp" or "pps".
         spec: its transport; None for PPS.
         channel: its channel in the log, without a sender.
         edge: of a PPS source, the edge that marks the second.
@@ -42,6 +45,13 @@ class Port:
     def is_aux(self) -> bool:
         """True for a head's second port."""
         return self.source.endswith("/aux")
+
+    @property
+    def tcp_port(self) -> int:
+        """The number of the port at which its device or caster serves; 0 where it comes otherwise."""
+        if self.spec is None or self.kind not in ("tcp", "ntrip"):
+            return 0
+        return self.spec.port if self.kind == "tcp" else self.spec.ntrip_port
 
     @property
     def options(self) -> dict[str, str]:
@@ -72,6 +82,7 @@ class Routes:
     ports: dict[str, Port]
     _udp: dict[int, list[Port]] = field(default_factory=dict)
     _can: dict[str, Port | None] = field(default_factory=dict)  # None: two buses share the name
+    _tcp: dict[int, list[Port]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, config: Config) -> Routes:
@@ -82,6 +93,8 @@ class Routes:
                 routes._udp.setdefault(port.spec.port, []).append(port)
             elif port.spec is not None and port.kind == "can":
                 routes._can[port.spec.channel] = None if port.spec.channel in routes._can else port
+            elif port.tcp_port:
+                routes._tcp.setdefault(port.tcp_port, []).append(port)
         return routes
 
     def of_datagram(self, unit: CapturedUnit) -> Port | None:
@@ -101,9 +114,21 @@ class Routes:
             found = [port for port in found if _bound_to(port) == unit.destination[0]]
         return found[0] if found else None
 
+    def of_stream(self, source: Address) -> Port | None:
+        """Return the port of the bytes that a device or caster sent by TCP from an address.
+
+        Its port number must be the configured one, and so must its host where the configuration gives an address; a
+        name is not looked up.
+        """
+        found = [port for port in self._tcp.get(source[1], ()) if _serves(port, source[0])]
+        named = [port for port in found if _is_address(_host(port))]
+        return named[0] if named else found[0] if len(found) == 1 else None
+
     def of_frame(self, unit: CapturedUnit) -> Port | None:
-        """Return the port of a CAN frame by its interface."""
-        return self._can.get(unit.channel)
+        """Return the port of a CAN frame by its interface; without a name of the interface, the only bus."""
+        if unit.channel in self._can:
+            return self._can[unit.channel]
+        return next(iter(self._can.values())) if not unit.channel and len(self._can) == 1 else None
 
     def of_heads(self, heads: Iterable[LvxHead]) -> dict[str, Port]:
         """Return the scanners, by code, that are the heads of a file: each is the one with the head's serial number, or
@@ -133,9 +158,31 @@ class Routes:
                 f"{one.source} ({one.protocol}{f', {one.serial}' if one.serial else ''})" for one in self._scanners()
             ]
             return ", ".join(named) or "none"
+        buses = [f"{name} ({port.source if port else 'of two'})" for name, port in self._can.items()]
         if kind == "pcap":
-            return ", ".join(f"{number} ({ports[0].source})" for number, ports in self._udp.items()) or "none"
-        return ", ".join(f"{name} ({port.source if port else 'of two'})" for name, port in self._can.items()) or "none"
+            udp = [f"{number} ({ports[0].source})" for number, ports in self._udp.items()]
+            tcp = [f"TCP {_host(one)}:{one.tcp_port} ({one.source})" for ports in self._tcp.values() for one in ports]
+            return ", ".join(udp + tcp + buses) or "none"
+        return ", ".join(buses) or "none"
+
+
+def _host(port: Port) -> str:
+    assert port.spec is not None
+    return port.spec.host if port.kind == "tcp" else port.spec.ntrip_host
+
+
+def _serves(port: Port, address: str) -> bool:
+    """Return whether a device's host may have an address."""
+    host = _host(port)
+    return not _is_address(host) or ip_address(host) == ip_address(address)
+
+
+def _is_address(text: str) -> bool:
+    try:
+        ip_address(text)
+    except ValueError:
+        return False
+    return True
 
 
 def _bound_to(port: Port) -> str:

@@ -25,9 +25,9 @@ class CapturedUnit:
 
     Attributes:
         time_ns: the recorder's wall clock, nanoseconds since 1970.
-        data: a datagram's payload, a SocketCAN frame of 16 or 72 bytes, or the bytes of one serial read.
-        channel: the CAN interface's name; ``udp`` or ``serial``.
-        source, destination: address and port of a datagram.
+        data: a datagram's payload, a SocketCAN frame of 16 or 72 bytes, or the bytes of one read of a stream.
+        channel: the CAN interface's name; ``udp``, ``tcp`` or ``serial``.
+        source, destination: address and port of a datagram or of a segment of TCP.
     """
 
     time_ns: int
@@ -48,10 +48,12 @@ class CaptureTally:
     Attributes:
         damage: number of places that could not be read. first_damage: the first of them, one line.
         passed: number of items left out on purpose, by kind.
+        missing_bytes: bytes of streams that the file should hold and does not; each gap is damage too.
     """
 
     damage: int = 0
     first_damage: str = ""
+    missing_bytes: int = 0
     passed: Counter[str] = field(default_factory=Counter)
 
     def damaged(self, text: str) -> None:

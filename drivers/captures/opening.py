@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING
 from swath.drivers.captures.base import Address, CapturedUnit, CaptureTally, open_capture, read_beginning, until_damage
 from swath.drivers.captures.candump import candump_line, held_by_line, is_candump, is_shown_candump, read_candump
 from swath.drivers.captures.lvx import LvxHead, is_lvx, read_lvx, read_lvx_heads, tells_time
-from swath.drivers.captures.pcap import is_pcap, read_pcap
+from swath.drivers.captures.pcap.files import is_pcap
+from swath.drivers.captures.pcap.reader import read_network, read_pcap
 from swath.drivers.captures.rosbag.kinds import bag_kind
 from swath.drivers.captures.serial import BareTime, chunk_table, read_bare, read_serial, read_tagged
 from swath.drivers.extras import how_to_install
@@ -46,6 +47,7 @@ __all__ = [
     "read_candump",
     "read_lvx",
     "read_lvx_heads",
+    "read_network",
     "read_pcap",
     "read_serial",
     "read_tagged",

@@ -120,10 +120,7 @@ class NtripTransport(DescriptorTransport):
         """
         data = b""
         while len(data) < MOST_HEADER_BYTES:
-            line, found, rest = data.partition(b"\r\n")
-            if found and line.startswith(b"ICY 200"):
-                return line, rest.removeprefix(b"\r\n")
-            head, found, rest = data.partition(b"\r\n\r\n")
+            head, found, rest = _split_head(data)
             if found:
                 return head, rest
             sock.settimeout(max(0.01, deadline_s - time.monotonic()))
@@ -215,6 +212,54 @@ def gga_sentence(lat_deg: float, lon_deg: float, height_m: float, now: datetime)
         parts += [f"{whole:0{digits}d}{minutes - 60.0 * whole:07.4f}", letters[value < 0.0]]
     body = f"GPGGA,{now:%H%M%S}.00,{','.join(parts)},1,10,1.0,{height_m:.1f},M,0.0,M,,".encode()
     return b"$%s*%02X\r\n" % (body, nmea_xor(body))
+
+
+class CasterReply:
+    """Takes the bytes of a stream of corrections out of a caster's reply, as captured.
+
+    A stream that was captured from its middle on has no head; its bytes are taken as they are.
+
+    Attributes:
+        wrong: what is wrong with the bytes fed last, one line; "" where nothing is.
+    """
+
+    def __init__(self) -> None:
+        self._head: bytes | None = None  # None: the stream begins here, or has begun
+        self._chunks: _Chunks | None = None
+        self.wrong = ""
+
+    def feed(self, data: bytes) -> bytes:
+        """Return what of the next bytes is the stream's."""
+        self.wrong = ""
+        if self._head is None and data.startswith((b"HTTP/", b"ICY ", b"SOURCETABLE ")):
+            self._head, self._chunks = b"", None
+        if self._head is not None:
+            head, end, data = _split_head(self._head + data)
+            if not end and len(head) < MOST_HEADER_BYTES:
+                self._head = head
+                return b""
+            lines = head.decode("latin-1").lower().split("\r\n")
+            self._head = None
+            if not end or not (lines[0].startswith("icy 200") or " 200" in lines[0]):
+                self.wrong = f"the caster answers {_printable(head.decode('latin-1').split(chr(13))[0])}"
+                data = data if end else head
+            chunked = any(line.startswith("transfer-encoding:") and "chunked" in line for line in lines)
+            self._chunks = _Chunks() if chunked else None
+        if self._chunks is None:
+            return data
+        try:
+            return self._chunks.feed(data)
+        except ValueError as error:  # bytes are missing: go on without the lengths, the parser finds its frames
+            self._chunks, self.wrong = None, str(error)
+            return data
+
+
+def _split_head(data: bytes) -> tuple[bytes, bytes, bytes]:
+    """Return an answer's head, its end ("" where it has not come) and the data behind; ICY 200 OK is a head itself."""
+    if data.startswith(b"ICY 200"):
+        line, found, rest = data.partition(b"\r\n")
+        return line, found, rest.removeprefix(b"\r\n")
+    return data.partition(b"\r\n\r\n")
 
 
 class _Chunks:

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from swath.drivers.captures.pcap_writer import FILE_HEADER, pcap_frames
+from swath.drivers.captures.pcap.writer import FILE_HEADER, pcap_frames
 from swath.drivers.scanner.hesai.at128 import CIRCLE, FINE, LASERS, MirrorAngles
 from swath.drivers.scanner.hesai.heads import MODE_LAST_STRONGEST, MODE_STRONGEST, HesaiHead
 from swath.drivers.scanner.hesai.parser import encode_point_packet

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from swath.drivers.captures.pcap_writer import FILE_HEADER, pcap_frames
+from swath.drivers.captures.pcap.writer import FILE_HEADER, pcap_frames
 from swath.drivers.scanner.livox.layout import (
     GPS_2,
     IMU_1,

@@ -18,6 +18,7 @@ from swath.drivers.captures.opening import (
     open_bag,
     read_candump,
     read_lvx,
+    read_network,
     read_pcap,
     read_serial,
     tells_time,
@@ -25,6 +26,7 @@ from swath.drivers.captures.opening import (
 from swath.drivers.captures.rosbag.messages import SENTENCE
 from swath.drivers.transports.base import TransportError
 from tests.drivers.captures.bags import CONTAINERS, Ros, every_type, write_bag
+from tests.drivers.captures.network import SYN, a_ms_apart, acknowledging, from_device, pcap_of
 from tests.drivers.livox_cases import FILES
 from tests.drivers.lvx_files import FileHead, lvx1_package, lvx2_package, lvx_file
 from tests.drivers.recordings import FIXTURES
@@ -64,6 +66,7 @@ WORDS = (
 def file_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
     """Yield the targets of capture readers, each with its own kind of file, and of the configuration with its files."""
     yield "pcap", lambda: _captures("pcap", _pcaps(), read_pcap)
+    yield "pcap-network", lambda: _captures("pcap-network", _networks(), _read_network)
     yield "candump", lambda: _captures("candump", _heads("nmea2000/*.log.gz", "canmod-gps/*.log.gz"), read_candump)
     yield "lvx", lambda: _captures("lvx", _lvxs(), _read_lvx)
     yield "serial", lambda: _captures("serial", [_serial_case()], _read_serial)
@@ -80,6 +83,23 @@ def _pcaps() -> list[bytes]:
     """Return the beginnings of captures, one of them gzipped and cut off."""
     found = _heads("*/*.pcap.gz")
     return [*found, gzip.compress(found[0])[:-20]]
+
+
+def _networks() -> list[bytes]:
+    """Return captures of TCP connections and CAN buses."""
+    frames = [from_device(99, b"abc", SYN), from_device(110, b"def"), acknowledging(103), from_device(103, bytes(9))]
+    classic = bytes.fromhex("98fea5d3080000000102030405060708")
+    cooked = [bytes.fromhex("0001011800000000000000000000000c") + classic]
+    return [
+        pcap_of(a_ms_apart(frames)),
+        pcap_of(a_ms_apart([classic, bytes.fromhex("000001230c050000") + bytes(12)]), 227),
+        pcap_of(a_ms_apart(cooked), 113, ">"),
+        *_heads("captures/tcp.pcap.gz"),
+    ]
+
+
+def _read_network(path: Path, tally: CaptureTally | None) -> Iterator[object]:
+    return read_network(path, lambda source, destination: source[1] > destination[1] % 40_000, tally)
 
 
 def _lvxs() -> list[bytes]:

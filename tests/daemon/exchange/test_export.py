@@ -26,7 +26,7 @@ from swath.daemon.exchange.export import MANIFEST, ExportReport, export_session
 from swath.daemon.exchange.sidecar import SUFFIX
 from swath.daemon.log.reader import open_logs
 from swath.drivers.can_frames import encode_can_frame
-from swath.drivers.captures.pcap_writer import FILE_HEADER, pcap_frames
+from swath.drivers.captures.pcap.writer import FILE_HEADER, pcap_frames
 from tests.builders import ROOT
 from tests.daemon.builders import ROVER_CONFIG, SREP, Pty, mcap_doctor, nmea_zda
 from tests.daemon.commands import swath

@@ -25,7 +25,7 @@ from swath.daemon.replay.units import timed_units
 from swath.drivers.can_frames import encode_can_frame
 from swath.drivers.captures.base import CaptureDamageError
 from swath.drivers.captures.opening import read_candump, read_pcap, read_serial
-from swath.drivers.captures.pcap_writer import FILE_HEADER, pcap_frames
+from swath.drivers.captures.pcap.writer import FILE_HEADER, pcap_frames
 from tests.builders import ROOT
 from tests.daemon.builders import mcap_doctor, run_python
 from tests.daemon.commands import swath
@@ -429,8 +429,8 @@ class TestRefusals:
     def test_a_capture_of_other_ports_is_reported(self, tmp_path: Path) -> None:
         path = write_pcap(tmp_path / "other.pcap", [b"x"] * 3, 5000)
         code, error, found = self.run(tmp_path, str(path))
-        want = f"{path}: holds port 5000 (3), but the configuration has 2368 (scanner/top), 8308 (scanner/top/aux); "
-        want += "give --source kind/name=FILE"
+        want = f"{path}: holds port 5000 (3), but the configuration has 2368 (scanner/top), 8308 (scanner/top/aux), "
+        want += "can1 (imu/main); give --source kind/name=FILE"
         assert (code, error, found["log"]) == (1, f"swath: {want}\n", [])
         assert found["captures"][0]["of_no_device"] == {"port 5000": 3}
 
@@ -481,7 +481,7 @@ class TestRefusals:
         code, error, _ = self.run(tmp_path, str(path), str(CANDUMP), text=text)
         assert code == 2
         assert error.splitlines() == [
-            f"swath: {path}: the configuration has no UDP port for it",
+            f"swath: {path}: the configuration has no UDP or TCP port and no CAN bus for it",
             f"swath: {CANDUMP}: the configuration has no CAN bus for it",
         ]
 

@@ -27,7 +27,8 @@ from swath.drivers.captures.opening import (
     read_pcap,
     read_serial,
 )
-from swath.drivers.captures.pcap import IpPackets, ip_packet
+from swath.drivers.captures.pcap.ip import UDP, IpPackets
+from swath.drivers.captures.pcap.links import ip_packet
 from swath.drivers.transports.base import TransportError
 
 FIXTURES = Path(__file__).parents[3] / "fixtures"
@@ -151,9 +152,9 @@ def test_ipv6_datagrams_after_extension_headers_are_read() -> None:
     packet = ipv6_with_options(17, segment)
     assert dpkt.ip6.IP6(packet).data.data == b"scan"
     packets = IpPackets()
-    assert packets.add(packet) == ("::1", "::2", segment)
+    assert packets.add(packet) == (UDP, "::1", "::2", segment)
     fragment = struct.pack(">BBHI", 17, 0, 0, 99)
-    assert packets.add(ipv6_with_options(44, fragment + segment)) == ("::1", "::2", segment)
+    assert packets.add(ipv6_with_options(44, fragment + segment)) == (UDP, "::1", "::2", segment)
     assert packets.add(ipv6_with_options(58, segment)) is None
     assert (packets.others, packets.cut) == (1, 0)
     assert packets.add(ipv6_with_options(17, segment, cut=90)) is None

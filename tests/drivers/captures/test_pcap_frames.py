@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from swath.drivers.captures.base import Address
 from swath.drivers.captures.opening import read_pcap
-from swath.drivers.captures.pcap_writer import FILE_HEADER, LATEST_PCAP_NS, largest_payload, pcap_frames
+from swath.drivers.captures.pcap.writer import FILE_HEADER, LATEST_PCAP_NS, largest_payload, pcap_frames
 
 SCANNER: Address = ("192.168.1.201", 2368)
 HEAD: Address = ("fe80::1", 2368)

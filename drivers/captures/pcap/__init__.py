@@ -1,0 +1,1 @@
+"""Captures of network and CAN traffic in pcap and pcapng: containers, link layers, IP, TCP, and the writer."""
