@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from swath.drivers.captures.pcap_writer import FILE_HEADER, NOBODY, pcap_frames
+from swath.drivers.captures.pcap.writer import FILE_HEADER, NOBODY, pcap_frames
 from swath.drivers.record_frames import ROWS, RowKind, Scale, encode_frame
 
 START_NS = 1_400_000_000_000_000_000  # GPS time

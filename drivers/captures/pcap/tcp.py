@@ -222,7 +222,7 @@ class TcpStreams:
             self._deliver(key, stream, max(time_ns, held_ns), at, data)
 
     def _deliver(self, key: tuple[Address, Address], stream: _Stream, time_ns: int, at: int, data: bytes) -> None:
-        """Deliver what of a segment that begins at or before the next byte is new."""
+        """Add the new bytes of a segment that begins at or before the next byte to the output."""
         again = min(len(data), stream.next - at)
         if at + again <= stream.at_first:
             self.earlier += again
