@@ -94,7 +94,16 @@ ROWS: dict[RowKind, np.dtype[Any]] = {
         [*_TIMED, ("names_next", "u1"), ("bound", "u1"), ("valid", "u1"), ("leap_seconds", "i1"), _MESSAGE]
     ),
     RowKind.MARK: np.dtype(
-        [*_TIMED, ("rising", "<i2"), ("valid", "<u2"), ("count", "<i8"), ("channel", "S24"), _MESSAGE]
+        [
+            *_TIME,
+            ("time_sigma_s", "<f8"),
+            ("count", "<i8"),  # −1: not given
+            ("rising", "<i2"),  # −1: not given
+            ("valid", "<u2"),
+            ("reserved", "<u4"),
+            ("channel", "S24"),
+            _MESSAGE,
+        ]
     ),
     RowKind.SAMPLE: np.dtype(
         [
@@ -151,13 +160,23 @@ def encode_frame(kind: RowKind, rows: StructArray, scale: Scale = Scale.GPS, fla
     length = OVERHEAD_BYTES + rows.nbytes
     if length > MAX_BYTES:
         raise ValueError(f"{len(rows)} rows need {length} bytes, a frame has {MAX_BYTES} at most")
-    content = HEADER.pack(SYNC, VERSION, kind, scale, flags, length, len(rows)) + rows.astype(ROWS[kind]).tobytes()
+    return pack_frame(kind, rows.astype(ROWS[kind]).tobytes(), len(rows), scale, flags)
+
+
+def pack_frame(kind: RowKind, data: bytes, count: int, scale: Scale, flags: int) -> bytes:
+    """Return the frame of ``count`` rows, given by their bytes."""
+    content = HEADER.pack(SYNC, VERSION, kind, scale, flags, OVERHEAD_BYTES + len(data), count) + data
     return content + CRC.pack(crc32(content))
+
+
+def most_rows(kind: RowKind) -> int:
+    """Return how many rows a frame can have."""
+    return (MAX_BYTES - OVERHEAD_BYTES) // ROWS[kind].itemsize
 
 
 def encode_frames(kind: RowKind, rows: StructArray, scale: Scale = Scale.GPS, flags: int = 0) -> Iterator[bytes]:
     """Encode any number of rows as frames."""
-    most = (MAX_BYTES - OVERHEAD_BYTES) // ROWS[kind].itemsize
+    most = most_rows(kind)
     for first in range(0, len(rows), most):
         yield encode_frame(kind, rows[first : first + most], scale, flags)
 

@@ -55,7 +55,8 @@ IMPORTED_LATE = {
     "swath.daemon.processing.vector_layers": {"shapefile"},  # for shapefiles only
     "swath.daemon.simulate.plans": {"swath.sim"},  # the only import of the virtual aircraft
     "swath.daemon.system": {"psutil"},
-    "swath.drivers.captures.opening": {"swath.drivers.captures.rosbag.bag"},  # rosbags
+    # rosbags; pyarrow
+    "swath.drivers.captures.opening": {"swath.drivers.captures.rosbag.bag", "swath.drivers.captures.tables"},
     "swath.drivers.imu.dbc.signals": {"cantools.database"},
     "swath.drivers.scanner.rows.filler": {"swath.drivers.scanner.rows.compiled"},  # numba
     "swath.drivers.scanner.velodyne.calibration": {"yaml"},

@@ -37,7 +37,8 @@ def command(
     files: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="FILE…", help="pcap, pcapng, candump -L, lvx or lvx2 files, bags, or the folder of an export."
+            metavar="FILE…",
+            help="pcap, pcapng, candump -L, lvx, lvx2, CSV or Parquet files, bags, or the folder of an export.",
         ),
     ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", metavar="DIR", help="Directory for the log.")] = None,
@@ -61,7 +62,7 @@ def command(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """Make a log from captures of tcpdump, candump, str2str or Livox Viewer, ROS bags, or files of `swath export`.
+    """Make a log from captures of tcpdump, candump, str2str, Livox Viewer, ROS bags, tables, or an export.
 
     CONFIG's UDP ports and CAN interfaces assign the units of pcap files and candump logs to devices; a serial stream
     needs --source. The topics of a bag go to the devices of their protocols, or are named by --source. Exit code 4 when

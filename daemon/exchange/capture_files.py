@@ -15,6 +15,7 @@ from swath.daemon.exchange.captures import Capture, has_times
 from swath.daemon.exchange.export import MANIFEST
 from swath.daemon.exchange.routes import Port, Routes
 from swath.daemon.exchange.sidecar import SUFFIX
+from swath.daemon.exchange.tables import RECORDS, is_folder_of_tables, settle_tables, table_of, tables_of_folder
 from swath.daemon.log.format import LogError, safe_attachment_path
 from swath.drivers.captures.opening import (
     BareTime,
@@ -24,6 +25,7 @@ from swath.drivers.captures.opening import (
     is_lvx,
     is_pcap,
     is_shown_candump,
+    is_table,
     read_beginning,
     read_lvx_heads,
     tells_time,
@@ -102,6 +104,7 @@ def find_captures(routes: Routes, files: Sequence[Path], options: ImportOptions)
     except UserError as error:
         wrong += map(one_line, error.message.splitlines())
         captures = []
+    settle_tables(captures)
     if not captures and not wrong:
         wrong.append("nothing to import; give captures or the folder of an export")
     if wrong:
@@ -123,6 +126,8 @@ def _named(routes: Routes, text: str, bags: BagChoice) -> list[Capture]:
     if kind == "bag":
         bags.name(path, port, selector)
         return []
+    if kind == "serial" and is_table(path) and port.protocol == RECORDS:
+        return [table_of(routes, path, port)]
     wanted = _KIND_OF_PORT[port.kind]
     if kind == "pcap" and port.kind == "serial" and not selector:
         raise UserError(
@@ -147,12 +152,14 @@ def _found(routes: Routes, path: Path, bags: BagChoice) -> list[Capture]:
     ``bags``.
     """
     if path.is_dir() and not bag_kind(path, b""):
-        return _of_export(routes, path)
+        return tables_of_folder(routes, path) if is_folder_of_tables(path) else _of_export(routes, path)
     head, damage = (b"", "") if path.is_dir() else read_beginning(path, _LOOKED_AT_BYTES)
     kind = _kind(path, head)
     if kind == "bag":
         bags.add(path)
         return []
+    if kind == "serial" and is_table(path):
+        return [table_of(routes, path, None)]
     if kind == "serial":
         if damage:
             raise TransportError(f"{path}: cannot be read: {damage}")

@@ -31,6 +31,7 @@ from swath.drivers.captures.opening import (
     read_lvx,
     read_network,
     read_serial,
+    read_table,
     read_tagged,
 )
 from swath.drivers.captures.pcap.writer import NOBODY
@@ -53,13 +54,14 @@ class Capture:
     """A file to import, its kind, and counts of the units found in it.
 
     Attributes:
-        kind: "pcap", "candump", "serial", "lvx", "bag" or "pps".
+        kind: "pcap", "candump", "serial", "lvx", "bag", "table" or "pps".
         port: the port whose units it holds; None if the units identify their ports themselves.
         selector: the only CAN interface, UDP or TCP port number, or head of an lvx file, whose units are used.
         time: timing of the bytes of a serial file without times.
         heads: of an lvx file, by code. head_ports: the ports of those that are used, by code. start_ns: of an lvx file
             whose packages have no UTC, the time at which it begins.
         topics: of a bag, the topics that are read, with their ports.
+        tells_time: the fixes of a table also name seconds, as there is no table of time messages.
         units: number used, by source.
         senders: of its datagrams, by source. connections: of its streams of TCP, by source.
         passed: number that belong to no device, by port, interface or topic.
@@ -75,6 +77,7 @@ class Capture:
     head_ports: Mapping[str, Port] = field(default_factory=dict)
     start_ns: int | None = None
     topics: Mapping[str, Port] = field(default_factory=dict)
+    tells_time: bool = True
     tally: CaptureTally = field(default_factory=CaptureTally)
     units: Counter[str] = field(default_factory=Counter)
     passed: Counter[str] = field(default_factory=Counter)
@@ -126,6 +129,10 @@ class Capture:
             return complete(units, self.path)
         if self.kind == "bag":
             return read_bag(self.path, list(self.topics), self.tally)
+        if self.kind == "table":
+            assert self.port is not None
+            device = self.port.source.partition("/")[0]
+            return read_table(self.path, device, tells_time=self.tells_time, tally=self.tally)
         if self.kind == "candump":
             return complete(read_candump(self.path, tally=self.tally), self.path, within_ns=1000)
         if self.kind == "lvx":

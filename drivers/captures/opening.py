@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from swath.drivers.captures.base import Address, CapturedUnit, CaptureTally, open_capture, read_beginning, until_damage
@@ -19,6 +20,7 @@ from swath.drivers.captures.pcap.files import is_pcap
 from swath.drivers.captures.pcap.reader import read_network, read_pcap
 from swath.drivers.captures.rosbag.kinds import bag_kind
 from swath.drivers.captures.serial import BareTime, chunk_table, read_bare, read_serial, read_tagged
+from swath.drivers.captures.tables.columns import is_table
 from swath.drivers.extras import how_to_install
 from swath.drivers.transports.base import TransportError
 
@@ -39,6 +41,7 @@ __all__ = [
     "is_lvx",
     "is_pcap",
     "is_shown_candump",
+    "is_table",
     "open_bag",
     "open_capture",
     "read_bag",
@@ -50,7 +53,9 @@ __all__ = [
     "read_network",
     "read_pcap",
     "read_serial",
+    "read_table",
     "read_tagged",
+    "table_columns",
     "tells_time",
 ]
 
@@ -68,6 +73,37 @@ def open_bag(path: Path) -> Bag:
             f"{path}: bags need rosbags, which is not installed: {how_to_install('import')}"
         ) from error
     return Bag(path)
+
+
+def table_columns(path: Path) -> list[str]:
+    """Return the names of the columns of a table of records.
+
+    Raises:
+        TransportError: it cannot be read, or pyarrow is not installed.
+    """
+    names: list[str] = _tables(path).column_names(path)
+    return names
+
+
+def read_table(
+    path: Path, device: str, *, tells_time: bool, tally: CaptureTally | None = None
+) -> Iterator[CapturedUnit]:
+    """Read a table of records as units of a kind of device; see `swath.drivers.captures.tables.read`.
+
+    Raises:
+        TransportError: it cannot be read, or pyarrow is not installed; without tally also: it is damaged.
+    """
+    return until_damage(_tables(path).read_table(path, device, tells_time=tells_time, tally=tally), tally)
+
+
+def _tables(path: Path) -> ModuleType:
+    try:
+        from swath.drivers.captures.tables import read
+    except ImportError as error:
+        raise TransportError(
+            f"{path}: tables need pyarrow, which is not installed: {how_to_install('frames')}"
+        ) from error
+    return read
 
 
 def read_bag(path: Path, names: Sequence[str], tally: CaptureTally | None = None) -> Iterator[CapturedUnit]:

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import gzip
+import io
 import random
 import tempfile
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
+
+import pyarrow
+import pyarrow.parquet
 
 from swath.daemon.config import load_config
 from swath.daemon.errors import UserError
@@ -24,6 +28,7 @@ from swath.drivers.captures.opening import (
     tells_time,
 )
 from swath.drivers.captures.rosbag.messages import SENTENCE
+from swath.drivers.captures.tables.read import read_table
 from swath.drivers.transports.base import TransportError
 from tests.drivers.captures.bags import CONTAINERS, Ros, every_type, write_bag
 from tests.drivers.captures.network import SYN, a_ms_apart, acknowledging, from_device, pcap_of
@@ -71,6 +76,7 @@ def file_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
     yield "lvx", lambda: _captures("lvx", _lvxs(), _read_lvx)
     yield "serial", lambda: _captures("serial", [_serial_case()], _read_serial)
     yield "bag", _bags
+    yield "table", _tables
     yield "config", _configuration
 
 
@@ -168,6 +174,34 @@ def _bags() -> Target:
 def _read_bag(path: Path, tally: CaptureTally | None) -> Iterator[object]:
     with open_bag(path) as bag:
         yield from until_damage(bag.units(list(bag.topics), tally), tally)
+
+
+# --- tables of records ----------------------------------------------------------------------------------------------
+
+_POINTS = b"gps_week,tow_s,x_m,y_m,z_m,intensity\n" + b"2423,118818.25,3,-4,12.5,9\n2423,118818.5,,nan,1e300,-1\n" * 40
+_FIXES = b"utc;lat_deg;lon_deg;height_m;valid;fix_type\n2026-06-15T09:00:00Z;47.5;8.5;500;true;RTK fixed\n"
+_SAMPLES = (
+    b"gps_ns,host_time_ns,device_time_ns,accel_x_g,accel_y_g,accel_z_g,gyro_x_deg_s,gyro_y_deg_s,gyro_z_deg_s\n"
+    b"1465549218000000000,1781514000000000000,5,0,0,-1,1,2,3\n-1,1781514000000000001,6,0,0,-1,1,2,3\n"
+)
+
+
+def _tables() -> Target:
+    parquet = io.BytesIO()
+    columns = {"unix_ns": [1_781_514_000_000_000_000, None], "x_m": [1.0, 2.0], "y_m": [3.0, 4.0], "z_m": [5, 6]}
+    pyarrow.parquet.write_table(pyarrow.table(columns), parquet)
+    seeds = [_POINTS, _FIXES, _SAMPLES, gzip.compress(_POINTS)[:-9], parquet.getvalue()]
+    return dataclasses.replace(_captures("table", seeds, _read_table), peak_bytes=lambda size: (64 << 20) + 400 * size)
+
+
+def _read_table(path: Path, tally: CaptureTally | None) -> Iterator[object]:
+    """Read a table as each kind of device, the parser's records too."""
+    for device in ("scanner", "gnss", "imu"):
+        try:
+            yield from until_damage(read_table(path, device, tells_time=True, tally=tally), tally)
+        except TransportError as error:
+            if "\n" in str(error):
+                raise FindingError(f"more than a line: {error}") from error
 
 
 # --- the configuration ----------------------------------------------------------------------------------------------

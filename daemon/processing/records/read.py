@@ -296,7 +296,7 @@ class LogRecords:
         known = np.array([time is not None for time in times], np.bool_)
         table["gps_ns"] = [NO_TIME_NS if time is None else time for time in times]
         table["time_sigma_s"][known & np.isnan(table["time_sigma_s"])] = 0.0
-        if clock is not None and self._host.status(clock, int(table["host_time_ns"][-1])).leap_doubt:
+        if clock is not None and len(table) and self._host.status(clock, int(table["host_time_ns"][-1])).leap_doubt:
             utc = np.array([tag is not None and tag.scale is TimeScale.UTC for tag in tags], np.bool_)
             table["time_sigma_s"][utc & known] = np.fmax(table["time_sigma_s"][utc & known], GUESSED_LEAP_S)
         return table
