@@ -104,7 +104,18 @@ put_in_place() {
     [ -n "$DESTDIR" ] || sync -f "$building" # a power cut must not find half of it on the disk
     [ ! -d "$program" ] || mv "$program" "$program.old"
     mv "$building" "$program"
+    name_other_drivers
     rm -rf "$program.old"
+}
+
+# They were installed beside the old program, from somewhere that only the administrator knows.
+name_other_drivers() {
+    for file in "$program.old"/lib/python3*/site-packages/*.dist-info/entry_points.txt; do
+        if grep -q '^\[swath\.drivers\]' "$file" 2>/dev/null; then
+            echo "the drivers of $(basename "${file%.dist-info/*}") were beside the old program; install that package again," \
+                "with $PREFIX/bin/pip, before the next recording"
+        fi
+    done
 }
 
 # What stands in /etc is the administrator's to change: it is not overwritten without a trace.

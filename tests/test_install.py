@@ -307,8 +307,17 @@ def test_a_failed_build_keeps_the_installed_program(root_before: Path, venv: str
 
 def test_a_new_program_replaces_the_previous_one_completely(root_before: Path) -> None:
     in_place = f'[ -e "{root_before}/opt/swath/lib/only_before.py" ] || exit 1'
+    for name, group in (("acme_lidar-1.2", "swath.drivers"), ("pygments-2.0", "console_scripts")):
+        info = root_before / f"opt/swath/lib/python3.11/site-packages/{name}.dist-info"
+        info.mkdir(parents=True)
+        (info / "entry_points.txt").write_text(f"[{group}]\nacme = acme:DRIVER\n")
     status, told = install_with(root_before, venv=in_place, pip=in_place, prefix="/opt/swath/")
     assert status == 0, told
+    named = [line for line in told.splitlines() if "drivers of" in line]
+    assert named == [
+        "the drivers of acme_lidar-1.2 were beside the old program; install that package again, with "
+        "/opt/swath/bin/pip, before the next recording"
+    ]
     assert sorted(path.name for path in (root_before / "opt").iterdir()) == ["swath"]
     assert not (root_before / "opt/swath/lib").exists()
     assert (root_before / "opt/swath/bin/swath").read_text() == "#!/opt/swath/bin/python\n"
