@@ -1,4 +1,6 @@
-"""Finds drivers by the ``DRIVERS`` tuples of the protocol files; a new device needs no entry in any list."""
+"""Finds drivers by the ``DRIVERS`` tuples of the protocol files, and those of other packages by their entry points; a
+new device needs no entry in any list.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +10,25 @@ import importlib.util
 import pkgutil
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
+from swath.drivers import plugins
+from swath.drivers.guard import guarded, guarded_call
+from swath.drivers.options import Options
 from swath.drivers.parser import ChosenRecords, DeviceKind, DeviceSettings, Parser, RawParser
-from swath.georef.records import ByteRows, EventMark, GnssFix, GnssHeading, NamesEdge, TimeMessage
+from swath.drivers.plugins import NotLoaded, Package
+from swath.georef.records import (
+    ByteRows,
+    EventMark,
+    GnssFix,
+    GnssHeading,
+    NamesEdge,
+    Record,
+    ScannerReturns,
+    TimeMessage,
+)
 
 if TYPE_CHECKING:
     from swath.drivers.startup import StartupMessage, StartupOptions
@@ -21,6 +36,8 @@ if TYPE_CHECKING:
 TransportKind = Literal["serial", "can", "udp", "tcp", "gnss", "imu", "scanner", "raw", "ntrip"]
 
 STREAM_TRANSPORTS: tuple[TransportKind, ...] = ("serial", "udp", "tcp")  # every wire that carries a byte stream
+
+INTERFACE = 1  # number of what `swath.drivers.interface` promises; a change that breaks a driver raises it
 
 KINDS: tuple[DeviceKind, ...] = ("gnss", "imu", "scanner", "corrections")
 MOST_ALIKE = 3
@@ -41,9 +58,28 @@ class UnknownProtocolError(LookupError):
     """No driver of that kind has that protocol; the text names the one that was probably meant, or all that exist."""
 
 
+class NotLoadedError(UnknownProtocolError):
+    """The driver of that protocol is in another package that cannot be used; the text says why."""
+
+
 @cache
 def all_drivers(kind: DeviceKind) -> dict[str, Driver]:
-    """Return all drivers of a kind by protocol name, from the ``DRIVERS`` of each module or of each package's
+    """Return all drivers of a kind by protocol name: Swath's own, and those of other packages that can be loaded."""
+    others = [driver for protocol in plugins.entry_points().of for driver in _of_package(protocol)[0]]
+    found = _built_in(kind) | {driver.protocol: driver for driver in others if driver.kind == kind}
+    return dict(sorted(found.items()))
+
+
+def not_loaded() -> list[NotLoaded]:
+    """Return the drivers of other packages that cannot be used, with the reasons."""
+    entries = plugins.entry_points()
+    found = [line for protocol in entries.of for line in _of_package(protocol)[1]]
+    return found if entries.fault is None else [entries.fault, *found]
+
+
+@cache
+def _built_in(kind: DeviceKind) -> dict[str, Driver]:
+    """Return Swath's own drivers of a kind by protocol name, from the ``DRIVERS`` of each module or of each package's
     ``parser`` module.
     """
     found: dict[str, Driver] = {}
@@ -53,7 +89,7 @@ def all_drivers(kind: DeviceKind) -> dict[str, Driver]:
         if driver.protocol in found:
             raise RuntimeError(f"two drivers declare {kind} protocol {driver.protocol!r}")
         found[driver.protocol] = driver
-    return dict(sorted(found.items()))
+    return found
 
 
 @cache
@@ -70,21 +106,106 @@ def _declared_in(folder: str) -> tuple[Driver, ...]:
     return tuple(found)
 
 
-def find_driver(kind: DeviceKind, protocol: str) -> Driver:
+@cache
+def _of_package(protocol: str) -> tuple[tuple[Driver, ...], list[NotLoaded]]:
+    """Return the drivers that another package declares for a protocol, or why they cannot be used."""
+    if protocol == RAW or any(protocol in _built_in(kind) for kind in KINDS):
+        reason = "Swath itself has a protocol of this name, which is used; give the package's protocol another name"
+        return (), [NotLoaded(protocol, package, reason) for package, _ in plugins.entry_points().of[protocol]]
+    found = plugins.imported(protocol)
+    if isinstance(found, list):
+        return (), found
+    package, declared = found
+    try:
+        fault = _fault(protocol, declared)
+    except (AttributeError, TypeError) as error:  # a field is not of its type
+        fault = f"its driver cannot be read: {error}; correct the package"
+    if fault:
+        return (), [NotLoaded(protocol, package, fault)]
+    return tuple(_guarded(driver, package) for driver in declared), []
+
+
+def _fault(protocol: str, declared: tuple[Any, ...]) -> str:
+    """Return why the objects of an entry point cannot be used as drivers; empty: they can."""
+    for driver in declared:
+        if not isinstance(driver, Driver):
+            return f"its entry point names a {type(driver).__name__}; want a Driver, or a tuple of them"
+        if driver.interface != INTERFACE:
+            other = "no interface" if driver.interface is None else f"interface {driver.interface}"
+            return (
+                f"it is written for {other} of drivers, this Swath has {INTERFACE}; install a version of the package "
+                "for it"
+            )
+        if driver.protocol != protocol:
+            return f"its driver has the protocol {driver.protocol!r}; give the entry point the same name"
+        where = f"its {driver.kind} driver"
+        if driver.kind not in KINDS:
+            return f"{where} is of no kind; want one of {', '.join(KINDS)}"
+        unknown = [one for one in driver.transports if one not in get_args(TransportKind)]
+        if unknown or not driver.transports:
+            return f"{where} names the transports {list(driver.transports)}; want some of {get_args(TransportKind)}"
+        if not set(driver.yields) <= set(get_args(Record)) or (driver.kind == "scanner") != (
+            ScannerReturns in driver.yields
+        ):
+            return f"{where} yields what such a device has not; want records, of a scanner ScannerReturns"
+        if driver.options is not None and not (
+            isinstance(driver.options, type) and issubclass(driver.options, Options)
+        ):
+            return f"{where} has options that are no subclass of swath.drivers.interface.Options"
+    kinds = [driver.kind for driver in declared]
+    return "" if kinds and len(set(kinds)) == len(kinds) else "it declares no driver, or two of one kind; want one"
+
+
+def _guarded(driver: Driver, package: Package) -> Driver:
+    """Return the driver of another package with all that it is called by guarded against its faults."""
+    name = str(package)
+    make, time, probe = driver.make_parser, driver.make_time_parser, driver.make_probe
+    sent, startup = driver.sent_file, driver.startup
+    return replace(
+        driver,
+        package=package,
+        make_parser=guarded(make, name, driver.yields),
+        make_time_parser=None if time is None else guarded(time, name, driver.yields),
+        make_probe=None if probe is None else guarded(probe, name, driver.yields),
+        sent_file=None if sent is None else replace(sent, find=guarded_call(sent.find, name)),
+        startup=None if startup is None else guarded_call(startup, name, refuse=True),
+    )
+
+
+def find_driver(kind: DeviceKind, protocol: str, recorded_with: str = "") -> Driver:
     """Return the driver of a protocol.
 
+    Args:
+        kind: gnss, imu, scanner, corrections or raw.
+        protocol: name of the protocol.
+        recorded_with: name and version of the other package whose driver it was for the recorder of a log; empty: it
+            was Swath's own, or no log is read.
+
     Raises:
-        UnknownProtocolError: the protocol is unknown; the text names those that were probably meant, or all known ones.
+        UnknownProtocolError: the protocol is unknown; the text names the package that is missing or cannot be loaded
+            (`NotLoadedError`), those protocols that were probably meant, or all known ones.
     """
     if protocol == RAW:
         return raw_driver(kind)
-    drivers = all_drivers(kind)
-    try:
-        return drivers[protocol]
-    except KeyError:
-        meant = probable_protocols(protocol, drivers)
-        known = f"did you mean {' or '.join(meant)}?" if meant else f"there are: {', '.join(sorted([*drivers, RAW]))}"
-        raise UnknownProtocolError(f"unknown {kind} protocol {protocol!r}; {known}") from None
+    if protocol in (built_in := _built_in(kind)):
+        return built_in[protocol]
+    if protocol in plugins.entry_points().of:
+        drivers, reasons = _of_package(protocol)
+        if reasons:
+            raise NotLoadedError(f"{kind} protocol {protocol!r}: {reasons[0]}")
+        for driver in drivers:
+            if driver.kind == kind:
+                return driver
+    elif recorded_with:
+        raise UnknownProtocolError(
+            f"{kind} protocol {protocol!r} is that of the package {recorded_with}, which is not installed here; "
+            "install it beside swath"
+        )
+    known = all_drivers(kind)
+    meant = probable_protocols(protocol, known)
+    there = f"there are: {', '.join(sorted([*known, RAW]))}; others need their package installed beside swath"
+    hint = f"did you mean {' or '.join(meant)}?" if meant else there
+    raise UnknownProtocolError(f"unknown {kind} protocol {protocol!r}; {hint}")
 
 
 def probable_protocols(wanted: str, drivers: Mapping[str, Driver]) -> list[str]:
@@ -169,6 +290,10 @@ class Driver:
         sent_file: what a scanner itself sends that serves as its ``geometry.file``; None: it sends no such thing.
         startup: builds the messages that a device needs before a survey, in sending order, and raises
             `DriverSettingsError`; None where the device needs no such message.
+        options: model of the keys that only this driver knows, the table ``options`` of its section; None: it has none.
+        interface: number of the `swath.drivers.interface` that it is written for, `INTERFACE`; a driver of another
+            package must state it.
+        package: the other package that it came from; None: Swath. Set when it is loaded.
     """
 
     protocol: str
@@ -190,6 +315,9 @@ class Driver:
     bytes_per_s: float | None = None
     sent_file: SentFile | None = None
     startup: Callable[[DeviceSettings, StartupOptions], tuple[StartupMessage, ...]] | None = None
+    options: type[Options] | None = None
+    interface: int | None = None
+    package: Package | None = None
 
 
 @cache
@@ -231,4 +359,6 @@ def receiver_inside(unit: Driver, make_parser: Callable[[DeviceSettings], Parser
         make_parser=make_parser or chosen,
         make_time_parser=unit.make_time_parser,
         names_edge=unit.names_edge,
+        options=unit.options,
+        interface=unit.interface,
     )

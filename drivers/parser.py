@@ -88,6 +88,11 @@ class Parser(ABC):
         """Return the records still held back at the end of a stream."""
         return []
 
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Facts that the units leave uncertain, one line for the user each."""
+        return ()
+
     def remarks(self) -> list[str]:
         """Return lines for the user: which settings or data were reinterpreted or refused, and the remedy."""
         return []
@@ -114,11 +119,6 @@ class StreamParser(Parser):
 
 class PacketParser(Parser):
     """Base of parsers for datagrams and CAN frames, whose units are whole; a subclass implements `parse_units`."""
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Facts that the units leave uncertain, one line for the user each."""
-        return ()
 
     def feed(self, chunk: Chunk) -> list[Record]:
         """Parse one unit as a batch of one row."""
@@ -195,6 +195,11 @@ class ChosenRecords(Parser):
     def close(self) -> list[Record]:
         """Return the wanted records still held back."""
         return self._chosen(self.parser.close())
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The parser's warnings."""
+        return self.parser.warnings
 
     def remarks(self) -> list[str]:
         """Return the parser's lines for the user."""

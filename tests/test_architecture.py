@@ -326,21 +326,6 @@ def test_every_event_is_documented() -> None:
     assert codes - explained == set()
 
 
-def test_the_example_of_a_new_device_is_a_driver() -> None:
-    from swath.drivers.driver import Driver
-    from swath.drivers.parser import DeviceSettings
-    from swath.georef.records import Chunk
-
-    (example,) = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs/adding-a-device.md").read_text(), re.M | re.S)
-    names: dict[str, Any] = {}
-    exec(example, names)
-    (driver,) = names["DRIVERS"]
-    assert isinstance(driver, Driver)
-    parser = driver.make_parser(DeviceSettings("gnss/rover"))
-    assert parser.feed(Chunk("gnss/rover", 0, b"abc")) == []
-    assert parser.counters.bytes == parser.counters.bytes_skipped == 3
-
-
 def loaded_by(code: str) -> set[str]:
     """Return names of all modules that a new interpreter has loaded after running this code.
 

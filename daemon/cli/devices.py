@@ -9,6 +9,7 @@ import typer
 
 if TYPE_CHECKING:
     from swath.drivers.driver import Driver
+    from swath.drivers.plugins import NotLoaded
 
 
 def describe_driver(driver: Driver) -> dict[str, Any]:
@@ -22,21 +23,28 @@ def describe_driver(driver: Driver) -> dict[str, Any]:
         "names_edge": str(driver.names_edge) if driver.names_edge is not None else None,
         "needs": list(driver.needs),
         "summary": driver.summary,
+        "package": None if driver.package is None else str(driver.package),
     }
 
 
 def command(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """List the supported protocols: their transports, their records and the configuration keys they need."""
-    from swath.drivers.driver import KINDS, all_drivers, raw_driver
+    """List the supported protocols: their transports, their records and the configuration keys they need.
+
+    Drivers of other packages are listed too, also those that cannot be loaded, with the reason.
+    """
+    from swath.drivers.driver import KINDS, all_drivers, not_loaded, raw_driver
 
     listed = [describe_driver(driver) for kind in KINDS for driver in all_drivers(kind).values()]
     listed.append(describe_driver(raw_driver("raw")))
+    refused = not_loaded()
     if as_json:
-        print(json.dumps({"devices": listed}, indent=2))
+        plain = [{"protocol": one.protocol, "package": str(one.package), "reason": one.reason} for one in refused]
+        print(json.dumps({"devices": listed, "not_loaded": plain}, indent=2))
         return
     _print_table(listed)
+    _print_refused(refused)
 
 
 def _print_table(listed: list[dict[str, Any]]) -> None:
@@ -57,5 +65,16 @@ def _print_table(listed: list[dict[str, Any]]) -> None:
         what.append("\nyields " + (", ".join(row["yields"]) or "no records"), style="dim")
         if row["needs"]:
             what.append("\nneeds " + ", ".join(row["needs"]), style="yellow")
+        if row["package"]:
+            what.append(f"\nfrom the package {row['package']}", style="dim")
         table.add_row(first, row["protocol"], ", ".join(row["transports"]), what)
     page_console().print(table)
+
+
+def _print_refused(refused: list[NotLoaded]) -> None:
+    from swath.daemon.cli.progress import page_console
+    from swath.daemon.errors import one_line
+
+    for one in refused:
+        line = one_line(f"{one.protocol}: {one}" if one.protocol else str(one))
+        page_console().print(line, style="red", markup=False, highlight=False, soft_wrap=True)

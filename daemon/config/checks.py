@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 from swath.daemon.config.config import Config, DeviceTable
+from swath.daemon.config.faults import describe
 from swath.daemon.config.rotations import rotation_problem
 from swath.daemon.config.tables import CorrectionsConfig, GnssConfig, ImuConfig, RawConfig, ScannerConfig
-from swath.drivers.driver import RAW, Driver, UnknownProtocolError, find_driver
+from swath.drivers.driver import RAW, Driver, NotLoadedError, UnknownProtocolError
 from swath.drivers.parser import DeviceKind, DriverSettingsError
 from swath.drivers.startup import StartupOptions
 from swath.drivers.transports.spec import TransportSpec, parse_pps, parse_transport
@@ -151,18 +152,21 @@ def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTabl
         yield from _check_calibration(config, name, table)
         yield from _check_gimbal(config, name, table)
     try:
-        driver = find_driver(kind, table.protocol)
+        driver = config.driver_of(kind, table)
+    except NotLoadedError as error:
+        yield f'{section}.protocol: {error}; protocol = "raw" records the device meanwhile'
+        return
     except UnknownProtocolError as error:
         yield f"{section}.protocol: {error}"
         return
     yield from _check_transport(config, section, table, driver)
     if isinstance(table, ScannerConfig):
         yield from _check_clock(section, table, driver)
-    needs = list(_check_needs(section, table, driver))
-    yield from needs
+    wrong = [*_check_needs(section, table, driver), *_check_options(config, kind, name, table, driver)]
+    yield from wrong
     carrier = config.carrier_of(table)  # its files are read too
     tables = [table] if carrier is None else [table, carrier[1]]
-    if not needs and not any(_unreadable(path) for one in tables for path in config.files_of(one).values()):
+    if not wrong and not any(_unreadable(path) for one in tables for path in config.files_of(one).values()):
         settings = config.settings_of(kind, name, table)
         try:
             driver.make_parser(settings)
@@ -202,6 +206,23 @@ def _check_needs(section: str, table: DeviceTable, driver: Driver) -> Iterator[s
             value = getattr(value, part, None)
         if value is None:
             yield f"{section}.{need}: missing; {driver.protocol} needs it: {_described(type(table), need)}"
+
+
+def _check_options(config: Config, kind: DeviceKind, name: str, table: DeviceTable, driver: Driver) -> Iterator[str]:
+    """Check the keys that only the driver knows: its own table's, or those of the device whose stream it is in."""
+    own = getattr(table, "options", {})
+    section, given, carrier = f"{kind}.{name}", own, config.carrier_of(table)
+    if not own and carrier is not None and driver.options is not None:
+        section, given = table.transport.replace(":", ".", 1), getattr(carrier[1], "options", {})
+    if driver.options is None:
+        if given and driver.protocol != RAW:
+            yield f"{section}.options: {driver.protocol} has no keys of its own; remove the table"
+        return
+    try:
+        driver.options.model_validate(given)
+    except ValidationError as error:
+        for details in error.errors(include_url=False):
+            yield describe(details, driver.options, f"{section}.options")
 
 
 def _described(model: type[BaseModel], key: str) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,13 +24,16 @@ from swath.daemon.config.tables import (
     SessionConfig,
     Tables,
 )
+from swath.drivers.driver import Driver, UnknownProtocolError, find_driver
 from swath.drivers.parser import DeviceKind, DeviceSettings
+from swath.drivers.plugins import Package
 from swath.drivers.transports.spec import TransportSpec, parse_transport
 
 DeviceTable = GnssConfig | ImuConfig | ScannerConfig | CorrectionsConfig | RawConfig
 FileKey = Literal["dbc", "calibration", "geometry"]
 _PATH_SOURCES = ("fixed", "serial-dcd")  # kinds of PPS source whose path may be relative
 PLAN_BESIDE = (".dbf", ".prj", ".cpg")  # files beside a shapefile that belong to it
+DRIVERS_NAME = "drivers.json"  # attachment that names the packages of drivers that are not Swath's own
 PARSER_FILES: tuple[FileKey, ...] = ("dbc", "geometry")  # files that a parser needs; it does not use the calibration
 
 
@@ -63,12 +67,21 @@ class DeviceEntry:
 
 
 class Config:
-    """The configuration of one recorder."""
+    """The configuration of one recorder.
 
-    def __init__(self, tables: Tables, path: Path, text: str) -> None:
+    Attributes:
+        tables: the tables of the file.
+        path: the file, whose folder relative names refer to.
+        text: content of the file.
+        recorded_with: of a log, name and version of the package whose driver its recorder had, by ``kind/protocol``,
+            where that was another one than Swath.
+    """
+
+    def __init__(self, tables: Tables, path: Path, text: str, recorded_with: Mapping[str, str] | None = None) -> None:
         self.tables = tables
         self.path = path
         self.text = text
+        self.recorded_with = dict(recorded_with or {})
 
     @property
     def session(self) -> SessionConfig:
@@ -173,6 +186,14 @@ class Config:
         for name, raw in self.raw.items():
             yield "raw", name, raw
 
+    def driver_of(self, kind: DeviceKind, table: DeviceTable) -> Driver:
+        """Return the driver of a device.
+
+        Raises:
+            UnknownProtocolError: there is none; of a log the text names the package that its recorder had.
+        """
+        return find_driver(kind, table.protocol, self.recorded_with.get(f"{kind}/{table.protocol}", ""))
+
     def files_of(self, table: DeviceTable) -> dict[FileKey, Path]:
         """Return the files that a device's table names, by key."""
         return {key: self.resolve(name) for key, name in _names_of(table).items()}
@@ -212,7 +233,8 @@ class Config:
         carrier = self.carrier_of(table)
         if carrier is not None:
             outer_name, outer = carrier
-            values = {**plain_table(outer), **values}
+            options = values.get("options") or plain_table(outer).get("options", {})
+            values = {**plain_table(outer), **values, "options": options}
             files = {**contents(outer_name, outer), **files}
         return DeviceSettings(f"{kind}/{name}", values, files, compiled)
 
@@ -255,6 +277,11 @@ class Config:
                     found.append((attachment, _media_type(path), path.read_bytes()))
         for path in self.plan_files():
             found.append((plan_attachment(path.name), _media_type(path), path.read_bytes()))
+        packages = {
+            key: {"package": package.name, "version": package.version} for key, package in self.packages().items()
+        }
+        if packages:
+            found.append((DRIVERS_NAME, "application/json", json.dumps(packages, indent=2).encode()))
         return found
 
     def plan_files(self) -> list[Path]:
@@ -267,6 +294,18 @@ class Config:
             beside = [path.with_suffix(one) for one in (*PLAN_BESIDE, *map(str.upper, PLAN_BESIDE))]
             shapes = [one for one in beside if one.is_file()] if path.suffix.lower() == ".shp" else []
             found += [one for one in (path, *shapes) if one not in found]
+        return found
+
+    def packages(self) -> dict[str, Package]:
+        """Return the other packages whose drivers the devices have, by ``kind/protocol``."""
+        found = {}
+        for kind, _, table in self.device_tables():
+            try:
+                package = self.driver_of(kind, table).package
+            except UnknownProtocolError:
+                continue
+            if package is not None:
+                found[f"{kind}/{table.protocol}"] = package
         return found
 
     def attachment_names(self) -> list[tuple[str, str]]:

@@ -124,6 +124,9 @@ class GnssConfig(Section):
     setup: GnssSetupConfig = Field(
         default_factory=GnssSetupConfig, description="settings that `swath setup` sends to it"
     )
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="keys of the driver's own, where it comes from another package"
+    )
 
 
 class SignalsConfig(Section):
@@ -230,6 +233,9 @@ class ImuConfig(Section):
         None, description='dbc: units that the DBC does not give, by signal, such as { "ACC.x" = "g" }'
     )
     noise: NoiseConfig = Field(default_factory=NoiseConfig, description="noise model for the navigation filter")
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="keys of the driver's own, where it comes from another package"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -344,6 +350,9 @@ class ScannerConfig(Section):
     )
     geometry: GeometryConfig | None = Field(None, description="how the beam is deflected")
     gimbal: GimbalConfig | None = Field(None, description="stages of a stabilised or pointed mount")
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="keys of the driver's own, where it comes from another package"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -366,6 +375,9 @@ class CorrectionsConfig(Section):
     protocol: Text = Field("rtcm3", description="rtcm3")
     forward_to: Text | None = Field(
         None, description="receiver whose serial or TCP port gets the bytes, such as gnss.rover"
+    )
+    options: dict[str, Any] = Field(
+        default_factory=dict, description="keys of the driver's own, where it comes from another package"
     )
 
 

@@ -26,8 +26,8 @@ from swath.daemon.log.directory import nearest_there
 from swath.daemon.log.host_clock import ClockDiscipline, read_clock_discipline
 from swath.daemon.log.wires import mixed_text
 from swath.drivers.driver import RAW, find_driver
+from swath.drivers.guard import GuardedParser
 from swath.drivers.listening import Listener
-from swath.drivers.parser import PacketParser
 from swath.drivers.session import Session
 from swath.drivers.transports.base import RawEdge, TransportCounters
 from swath.drivers.transports.can.bitrate import interface_bitrate
@@ -132,8 +132,7 @@ class Reading:
             self.report.facts, self.report.doubts = self.values.judge(self.entry.kind, self.entry.settings.config)
             never_set = stamp_doubts(self.entry, self.heard)
             self.report.doubts += never_set
-            if isinstance(self.parser, PacketParser):
-                self.report.notes += self.parser.warnings
+            self.report.notes += self.parser.warnings
             self.report.notes += [] if never_set else lock_notes(self.entry, self.heard)
             self.report.notes += far_notes(self.heard, read_clock_discipline())
 
@@ -290,6 +289,8 @@ def _answer_problems(reading: Reading) -> list[str]:
     entry, heard, counters = reading.entry, reading.heard, reading.parser.counters
     if entry.protocol == RAW:
         return []
+    if isinstance(reading.parser, GuardedParser) and reading.parser.fault:
+        return [reading.parser.fault.removeprefix(f"{entry.source}: ")]
     good = counters.messages.total()
     remarks = reading.parser.remarks()
     other = not_understood(entry, heard, good, reading.kept, refused=counters.bad_messages, remarks=remarks)

@@ -16,7 +16,7 @@ from swath.daemon.log.claim import is_being_written
 from swath.daemon.log.directory import nearest_there
 from swath.daemon.log.host_clock import read_clock_discipline
 from swath.daemon.log.parts import read_sign
-from swath.drivers.driver import find_driver
+from swath.drivers.driver import find_driver, not_loaded
 from swath.drivers.transports.can.bitrate import interface_bitrate
 from swath.drivers.transports.spec import TransportSpec
 from swath.drivers.transports.udp_port import DEFAULT_BUFFER_MB
@@ -46,6 +46,14 @@ def examine(config: Config | None, *, write: bool = True) -> Iterator[Finding]:
     yield from _clock(tree)
     yield from _disk(tree, config, write)
     yield from _devices(tree, config, specs)
+    yield from other_drivers()
+
+
+def other_drivers() -> Iterator[Finding]:
+    """Report drivers of other packages that cannot be used; a configuration that needs one is refused earlier."""
+    for one in not_loaded():
+        what = f"protocol {one.protocol}: " if one.protocol else ""
+        yield Finding("drivers", Verdict.NOTE, f"{what}{one}", "swath devices")
 
 
 def _specs(config: Config | None) -> list[TransportSpec]:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
 from pydantic import ValidationError
 
-from swath.daemon.config.config import Config, DeviceTable, attachment_name
+from swath.daemon.config.config import DRIVERS_NAME, Config, DeviceTable, attachment_name
 from swath.daemon.config.tables import Tables
+from swath.daemon.errors import one_line
 from swath.daemon.log.format import LogError
-from swath.drivers.driver import UnknownProtocolError, find_driver
+from swath.drivers.driver import UnknownProtocolError
 from swath.drivers.parser import DriverSettingsError, Parser
 from swath.georef.toml_tables import TomlError, toml_tables
 
@@ -27,9 +29,24 @@ def stored_config(attachments: Mapping[str, bytes]) -> Config | None:
         return None
     try:
         text = stored.decode()
-        return Config(Tables.model_validate(toml_tables(text)), Path("config.toml"), text)
+        tables = Tables.model_validate(toml_tables(text))
     except (UnicodeDecodeError, TomlError, ValidationError) as error:
         raise LogError(f"config.toml in the log: {str(error).splitlines()[0]}") from error
+    return Config(tables, Path("config.toml"), text, _recorded_with(attachments.get(DRIVERS_NAME, b"{}")))
+
+
+def _recorded_with(stored: bytes) -> dict[str, str]:
+    """Return name and version of packages by ``kind/protocol``; what is not of that form is passed over."""
+    try:
+        found = json.loads(stored)
+    except ValueError:
+        return {}
+    entries = found.items() if isinstance(found, dict) else ()
+    return {
+        key: one_line(f"{value.get('package', '?')} {value.get('version', '')}").strip()
+        for key, value in entries
+        if isinstance(value, dict)
+    }
 
 
 def stored_drivers(attachments: Mapping[str, bytes]) -> tuple[dict[str, Callable[[], Parser]], list[str]]:
@@ -53,7 +70,7 @@ def stored_drivers(attachments: Mapping[str, bytes]) -> tuple[dict[str, Callable
     for kind, name, table in config.device_tables():
         settings = config.settings_with(kind, name, table, contents)
         try:
-            makers[settings.source] = partial(find_driver(kind, table.protocol).make_parser, settings)
+            makers[settings.source] = partial(config.driver_of(kind, table).make_parser, settings)
         except UnknownProtocolError as error:
             troubles.append(f"{settings.source}: {error}")
     return makers, troubles

@@ -15,7 +15,7 @@ from swath.daemon.log.parsers import stored_config, stored_parsers
 from swath.daemon.log.reader import Session
 from swath.daemon.log.wires import Senders
 from swath.daemon.log.words import stream_faults
-from swath.drivers.parser import PacketParser, Parser
+from swath.drivers.parser import Parser
 from swath.georef.arrays import Int64Array
 from swath.georef.records import ChunkBatch, Record
 
@@ -246,8 +246,7 @@ def record_count(record: Record) -> int:
 
 def parser_lines(source: str, parser: Parser) -> list[str]:
     """Return what a parser has to tell the user of its data, one line each, with the source's name."""
-    doubts = parser.warnings if isinstance(parser, PacketParser) else ()
-    return [*parser.remarks(), *(f"{source}: {doubt}" for doubt in doubts)]
+    return [*parser.remarks(), *(f"{source}: {doubt}" for doubt in parser.warnings)]
 
 
 def _silent_antennas(attachments: Mapping[str, bytes], sources: dict[str, SourceNumbers]) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
+from swath.drivers.guard import DRIVER_FAULT
 from swath.drivers.parser import Parser
 
 BAD_CHECKSUM = "bad_checksum"
@@ -20,6 +21,7 @@ WHY = {
     "wrong_product": "they are of another model than that of the configured protocol",
     "wrong_serial": "they are of another head than that of geometry.file",
     "other_head": "they are of another head on the same hub",
+    DRIVER_FAULT: "their driver, which is not Swath's own, failed on them; `swath info` says how",
 }
 
 
@@ -51,7 +53,7 @@ def refused_by(parser: Parser) -> Counter[str]:
         {
             code: count
             for code, count in counters.errors.items()
-            if code.startswith("bad_") or code in (SEQUENCE_GAP, *OTHER_HEADS)
+            if code.startswith("bad_") or code in (SEQUENCE_GAP, DRIVER_FAULT, *OTHER_HEADS)
         }
     )
     found[BAD_CHECKSUM] = counters.bad_checksums

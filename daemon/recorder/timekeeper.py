@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 
 from swath.daemon.log.events import Events, Severity
 from swath.daemon.log.host_clock import ClockDiscipline
+from swath.drivers.guard import GuardedParser
 from swath.drivers.parser import Parser
 from swath.drivers.transports.base import UnitBlock
 from swath.georef.arrays import Int64Array
@@ -146,8 +147,12 @@ class TimeKeeper:
     def _tell_remarks(self, time_source: _TimeSource) -> None:
         """Post each remark of the parser once: receiver data that it corrects, or refuses."""
         for remark in time_source.parser.remarks():
-            if remark not in time_source.remarks:
-                time_source.remarks.append(remark)
+            if remark in time_source.remarks:
+                continue
+            time_source.remarks.append(remark)
+            if isinstance(time_source.parser, GuardedParser) and remark == time_source.parser.fault:
+                self._events.post(Severity.ERROR, time_source.source, "time_parser_failed", remark)
+            else:
                 self._events.post(Severity.WARNING, time_source.source, "date_doubtful", remark)
 
     def edge_seen(self, source: str) -> Callable[[int, int], None]:

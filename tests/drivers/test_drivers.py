@@ -6,11 +6,9 @@ A driver's recordings lie in ``fixtures/<protocol>/`` or in that of its family, 
 
 from __future__ import annotations
 
-import re
 from contextlib import suppress
 from dataclasses import replace
 from itertools import accumulate
-from typing import Any
 
 import numpy as np
 import pytest
@@ -68,21 +66,6 @@ def test_every_scanner_declares_its_beam_geometry(driver: Driver) -> None:
     for parser in parsers:
         told = (driver.line_scanner, driver.aimed, hasattr(parser, "beams") or hasattr(parser, "head"))
         assert sum(told) == 1, told
-
-
-def test_the_example_driver_of_the_documentation_works() -> None:
-    """The example is part of docs/adding-a-device.md."""
-    page = (FIXTURES.parent / "docs/adding-a-device.md").read_text()
-    [block] = re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)
-    module: dict[str, Any] = {}
-    exec(block, module)
-    [driver] = module["DRIVERS"]
-    assert driver.summary
-    assert driver.transports
-    assert driver.yields
-    parser = driver.make_parser(DeviceSettings("gnss/test"))
-    assert parser.feed(Chunk("gnss/test", 0, b"abc")) == []
-    assert (parser.counters.bytes, parser.counters.bytes_skipped) == (3, 3)
 
 
 def test_a_driver_without_a_documentation_page_is_reported() -> None:

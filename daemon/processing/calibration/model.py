@@ -26,7 +26,7 @@ from pydantic import (
 )
 
 from swath.calib.parameters import MODELS, ParameterOptions
-from swath.daemon.config.load import describe, shown
+from swath.daemon.config.faults import describe, shown
 from swath.daemon.config.tables import Section
 from swath.daemon.errors import ConfigError, ExitCode, UserError, one_line
 from swath.daemon.text_files import text_of

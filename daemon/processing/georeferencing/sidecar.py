@@ -197,10 +197,12 @@ def _of(results: Sequence[JobResult], flight: Flight, flights: Sequence[Flight])
 def _flight_entry(flight: Flight, results: Sequence[JobResult]) -> dict[str, Any]:
     setup, trajectory = flight.setup, flight.trajectory
     assert trajectory is not None
+    packages = {key: str(package) for key, package in setup.config.packages().items()}
     return {
         "session": flight.session.session_id,
         "start": utc_text(flight.session.info.realtime_ns),
         "recorder": flight.session.info.software,
+        **({"drivers": packages} if packages else {}),
         "aircraft": setup.config.profile.aircraft or None,
         "operator": setup.config.profile.operator or None,
         "origin": flight.session.info.origin or "recording",

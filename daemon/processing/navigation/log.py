@@ -13,7 +13,6 @@ from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.host_messages import feed_clocks
 from swath.daemon.log.reader import Session
 from swath.daemon.processing.undecoded import refused_by
-from swath.drivers.parser import PacketParser
 from swath.georef.arrays import StructArray
 from swath.georef.records import (
     IMU_DTYPE,
@@ -100,8 +99,7 @@ class _Reader:
             found.remarks += parser.remarks()
             counters = parser.counters
             found.heard[name] = counters.bytes, counters.bytes_skipped, counters.messages
-            if isinstance(parser, PacketParser):
-                found.warnings += [f"{name}: {doubt}" for doubt in parser.warnings]
+            found.warnings += [f"{name}: {doubt}" for doubt in parser.warnings]
         found.host.update()
         found.remarks += found.host.settle()
         if self._imu:

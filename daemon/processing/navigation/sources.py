@@ -16,7 +16,7 @@ from swath.daemon.log.format import LogError, SessionInfo
 from swath.daemon.log.parsers import stored_config
 from swath.daemon.processing.setup.models import gimbal_sources
 from swath.daemon.processing.setup.sources import Sources
-from swath.drivers.driver import RAW, UnknownProtocolError, find_driver
+from swath.drivers.driver import RAW, UnknownProtocolError
 from swath.drivers.parser import DriverSettingsError, Parser
 from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.navigation.inputs import ARM_UNSAID_M, GRADES, ImuNoise, Setup, imu_noise
@@ -145,7 +145,7 @@ class NavigationSources:
             source = f"{kind}/{name}"
             try:
                 settings = self.config.settings_with(kind, name, table, self._files, compiled=True)
-                made[source] = find_driver(kind, table.protocol).make_parser(settings)
+                made[source] = self.config.driver_of(kind, table).make_parser(settings)
             except UnknownProtocolError as error:
                 raise ConfigError(f"{kind}.{name}.protocol: {error}") from error
             except DriverSettingsError as error:
@@ -259,7 +259,8 @@ def without_scanners(config: Config, **tables: Any) -> Config:
         "output": OutputConfig.model_validate({}),
         "mta": MtaConfig.model_validate({}),
     }
-    return Config(config.tables.model_copy(update=update | tables), config.path, config.text)
+    tables_left = config.tables.model_copy(update=update | tables)
+    return Config(tables_left, config.path, config.text, config.recorded_with)
 
 
 def _chosen(kind: str, wanted: str | None, known: list[str], usual: list[str]) -> str:

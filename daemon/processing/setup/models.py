@@ -220,10 +220,11 @@ def make_motion(table: ScannerConfig, model: SensorModel) -> Motion | None:
 
 def motion_of(table: ScannerConfig) -> Motion:
     """Return the estimator of a scanner's encoder motion."""
-    if find_driver("scanner", table.protocol).aimed:
+    driver = find_driver("scanner", table.protocol)
+    if driver.aimed:
         return NoMotion()
     kind = table.geometry.type if table.geometry is not None else None
-    swings = table.protocol == "srep" and kind in (None, "oscillating")
+    swings = driver.line_scanner and kind in (None, "oscillating")
     return EncoderMotion(steady=not swings, facets=kind == "polygon")
 
 

@@ -14,7 +14,7 @@ from swath.daemon.config.tables import GnssConfig, ImuConfig, ScannerConfig
 from swath.daemon.errors import ConfigError
 from swath.daemon.log.format import SessionInfo
 from swath.daemon.processing.setup.models import gimbal_sources
-from swath.drivers.driver import RAW, Driver, UnknownProtocolError, find_driver
+from swath.drivers.driver import RAW, Driver, UnknownProtocolError
 from swath.drivers.parser import DeviceKind, DriverSettingsError, Parser
 from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.geodesy.rotations import attitude_of, rot_l_from_b
@@ -177,7 +177,7 @@ class Sources:
 
     def _driver(self, kind: DeviceKind, name: str, table: DeviceTable) -> Driver:
         try:
-            return find_driver(kind, table.protocol)
+            return self.config.driver_of(kind, table)
         except UnknownProtocolError as error:
             raise ConfigError(f"{kind}.{name}.protocol: {error}") from error
 
@@ -191,7 +191,7 @@ class Sources:
         heads: dict[str, GnssPlan] = {}  # heads that report the time themselves, if no other source does
         for name in self.scanners:
             table, source = config.scanner[name], f"scanner/{name}"
-            driver = find_driver("scanner", table.protocol)
+            driver = self._driver("scanner", name, table)
             clock = self.clock_of(table.pps)
             if clock is None:
                 heads[source] = GnssPlan()

@@ -1,0 +1,1 @@
+"""Drivers for Swath: a scanner and a receiver that do not exist."""
