@@ -91,6 +91,11 @@ def _units(batch: Batch) -> Iterator[tuple[str, int, bytes]]:
             yield batch.wire, time_ns, unit.tobytes()
 
 
+def _reports(batch: Batch) -> Iterator[tuple[str, int, dict[str, Any]]]:
+    for time_ns, values in batch.reports:
+        yield batch.wire.removeprefix("/status/").removeprefix("/"), time_ns, values
+
+
 class _Stream:
     """What comes from wires or a log, in order of arrival, for one task at a time."""
 
@@ -318,6 +323,15 @@ class Following(_Many):
         name: str = self._listening.session_id
         return name
 
+    async def reports(self) -> AsyncIterator[tuple[str, int, dict[str, Any]]]:
+        """Yield what the recorder itself reports: source, host time, ns, and values.
+
+        Of ``events`` the values are those of an event (source, code, severity, text), of a source, as ``scanner/left``,
+        its status each second (state, units, losses).
+        """
+        async for found in self._each("reports", _reports):
+            yield found
+
     async def __aiter__(self) -> AsyncIterator[Received]:
         """Open the log and yield its records one by one, until the loop is left."""
         async with self:
@@ -405,7 +419,7 @@ def follow(
     """
     if not Path(directory).is_dir():
         raise UserError(f"{directory}: is not a directory; give that of the recorder's logs")
-    return Following(str(directory), _live().LogListening(Path(directory), tail_s=tail_s, **_queue(overflow, queue_mb)))
+    return Following(str(directory), _live().DecodedLog(Path(directory), tail_s=tail_s, **_queue(overflow, queue_mb)))
 
 
 def _listening(config: Config, overflow: str, queue_mb: float, *, times: bool) -> Listening:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
-import select
 import sys
 import termios
 import time
 import tty
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import aclosing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,14 +20,13 @@ from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.log.directory import DEFAULT_CONFIG, log_directory
 
 if TYPE_CHECKING:
-    from rich.console import Group
-
-    from swath.daemon.monitor.display import Monitor
+    from rich.console import Console, Group
 
 EVENTS_SHOWN = 8
 MARK_KEY = "m"
 MARK_TEXT = "marked in swath monitor"
 KEYS = f"{MARK_KEY}: write a mark into the log; Ctrl-C: leave"
+LOOK_S = 0.1  # between two looks with --once
 FIRST_STATUS_S = 3.0  # a recorder writes its first status one second after its start
 STATE_STYLE = {"receiving": "green", "silent": "red", "stuck": "red", "absent": "red", "opening": "yellow"}
 EXIT = {"recording": ExitCode.OK, "degraded": ExitCode.PROBLEM, "not recording": 2}
@@ -53,53 +52,85 @@ def command(
     for recording, 1 for degraded, 2 for not recording.
     """
     from rich.console import Console
-    from rich.live import Live
-
-    from swath.daemon.monitor.display import Monitor
 
     directory = log_directory(where)
-    monitor = Monitor(directory, decode=decode)
     if once:
-        raise typer.Exit(int(EXIT[_once(monitor, as_json)]))
+        raise typer.Exit(int(EXIT[asyncio.run(_once(directory, as_json, decode=decode))]))
     console = Console()
     if as_json or not console.is_terminal:
-        while True:
-            monitor.poll()
+        asyncio.run(_print(directory, every, as_json, decode=decode))
+    else:
+        asyncio.run(_show(directory, every, console, decode=decode))
+
+
+async def _once(directory: Path, as_json: bool, *, decode: bool) -> str:
+    """Print the state as soon as it is known; return the verdict."""
+    from swath.daemon.monitor.display import watch
+
+    deadline_s = time.monotonic() + FIRST_STATUS_S
+    found: dict[str, Any] = {}
+    async with aclosing(watch(directory, LOOK_S, decode=decode)) as looks:
+        async for monitor in looks:
+            found = monitor.snapshot()
+            starts = found["verdict"] != "not recording" and not found["sources"] and time.monotonic() < deadline_s
+            if not (monitor.is_undecided or starts):
+                break
+    print(json.dumps(found, indent=2) if as_json else one_line(found["sentence"]))
+    return str(found["verdict"])
+
+
+async def _print(directory: Path, every_s: float, as_json: bool, *, decode: bool) -> None:
+    from swath.daemon.monitor.display import watch
+
+    async with aclosing(watch(directory, every_s, decode=decode)) as looks:
+        async for monitor in looks:
             found = monitor.snapshot()
             print(json.dumps(found) if as_json else one_line(found["sentence"]), flush=True)
-            time.sleep(every)
+
+
+async def _show(directory: Path, every_s: float, console: Console, *, decode: bool) -> None:
+    """Show a page until Ctrl-C."""
+    from rich.live import Live
+
+    from swath.daemon.monitor.display import watch
+
     foot = KEYS
-    with _keys() as pressed, Live(console=console, auto_refresh=False, screen=True) as live:
-        while True:
-            monitor.poll()
-            live.update(page(monitor.snapshot(), foot), refresh=True)
-            if MARK_KEY in pressed(every):
-                foot = f"{_mark(directory)}; {KEYS}"
+    marks: list[asyncio.Future[str]] = []
+
+    def pressed(keys: str) -> None:
+        if MARK_KEY in keys:
+            marks.append(asyncio.get_running_loop().run_in_executor(None, _mark, directory))
+
+    with _keys(pressed), Live(console=console, auto_refresh=False, screen=True) as live:
+        async with aclosing(watch(directory, every_s, decode=decode)) as looks:
+            async for monitor in looks:
+                while marks and marks[0].done():
+                    foot = f"{marks.pop(0).result()}; {KEYS}"
+                live.update(page(monitor.snapshot(), foot), refresh=True)
 
 
 @contextmanager
-def _keys() -> Iterator[Callable[[float], str]]:
-    """Give a function that waits for keys for at most so many seconds and returns them; the terminal shows none."""
-
-    def wait(timeout_s: float) -> str:
-        time.sleep(timeout_s)
-        return ""
-
-    def pressed(timeout_s: float) -> str:
-        ready, _, _ = select.select([terminal], [], [], timeout_s)
-        if not ready:
-            return ""
-        return os.read(terminal, 64).decode("ascii", "ignore") or wait(timeout_s)  # a closed terminal is always ready
-
+def _keys(pressed: Callable[[str], None]) -> Iterator[None]:
+    """Call a function with the keys that are pressed; the terminal shows none."""
     if not sys.stdin.isatty():
-        yield wait
+        yield
         return
-    terminal = sys.stdin.fileno()
+    terminal, loop = sys.stdin.fileno(), asyncio.get_running_loop()
+
+    def read() -> None:
+        keys = os.read(terminal, 64).decode("ascii", "ignore")
+        if keys:
+            pressed(keys)
+        else:  # a closed terminal is always ready
+            loop.remove_reader(terminal)
+
     before = termios.tcgetattr(terminal)
     try:
         tty.setcbreak(terminal)
-        yield pressed
+        loop.add_reader(terminal, read)
+        yield
     finally:
+        loop.remove_reader(terminal)
         termios.tcsetattr(terminal, termios.TCSADRAIN, before)
 
 
@@ -113,21 +144,6 @@ def _mark(directory: Path) -> str:
     except UserError as error:
         return one_line(f"no mark: {error}")
     return f"marked at {clock_text(answer['time_ns'])}"
-
-
-def _once(monitor: Monitor, as_json: bool) -> str:
-    deadline_s = time.monotonic() + FIRST_STATUS_S
-    monitor.poll()
-    found = monitor.snapshot()
-    while monitor.is_undecided or (
-        found["verdict"] != "not recording" and not found["sources"] and time.monotonic() < deadline_s
-    ):
-        time.sleep(0.1)
-        monitor.poll()
-        found = monitor.snapshot()
-    monitor.close()
-    print(json.dumps(found, indent=2) if as_json else one_line(found["sentence"]))
-    return str(found["verdict"])
 
 
 def page(found: dict[str, Any], foot: str = "") -> Group:

@@ -41,6 +41,7 @@ from swath.georef.records import ChunkBatch, PpsEdge, Record
 
 READING_S = 0.1  # between two readings of the host's clocks
 EDGE_BYTES = 100
+REPORT_BYTES = 2000
 STREAMS = ("serial", "tcp", "ntrip")
 QUEUE_BYTES = 64 << 20  # of each wire: raw units and decoded rows that the loop has not taken yet
 
@@ -87,6 +88,7 @@ class Batch:
         records: decoded, by source: of the device, and of those inside its stream.
         times: GPS times of these records, in their order; empty without clocks.
         edges: of a pulse, as they were stamped; such a batch has nothing else.
+        reports: of a recorder, with their host times, ns; the wire is ``/events`` or ``/status/scanner/left``.
     """
 
     wire: str
@@ -94,13 +96,14 @@ class Batch:
     records: dict[str, list[Record]]
     times: dict[str, list[Times]] = field(default_factory=dict)
     edges: list[RawEdge] = field(default_factory=list)
+    reports: list[tuple[int, dict[str, Any]]] = field(default_factory=list)
 
     @property
     def measured(self) -> Measured[Batch]:
         """The batch with its size."""
         raw_bytes = sum(one.units.size for one in self.units)
         rows = sum(getattr(record, "rows", _NO_ROWS).nbytes for records in self.records.values() for record in records)
-        size_bytes = raw_bytes + rows + EDGE_BYTES * len(self.edges)
+        size_bytes = raw_bytes + rows + EDGE_BYTES * len(self.edges) + REPORT_BYTES * len(self.reports)
         return Measured(self, size_bytes, sum(len(one.units) for one in self.units) + len(self.edges), raw_bytes)
 
 

@@ -1,16 +1,20 @@
 """Follows a log that is being written: each chunk as it becomes complete, then the next part, then the next session.
 
-It only reads files and holds one chunk in memory at a time; the recorder is not affected.
+It only reads files and holds one chunk in memory at a time; the recorder is not affected. `LogListening` follows in a
+thread, for programs of asyncio.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import os
 import struct
+import threading
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Generic, Self, TypeVar
 
 from mcap import records
 
@@ -29,7 +33,10 @@ from swath.daemon.log.mcap.scan import (
     unpack_chunk,
 )
 from swath.daemon.log.parts import Sign, read_sign
+from swath.drivers.listening import LoopReader, Measured, Overflow
 
+LOG = "log"  # the one lane of a log
+ItemT = TypeVar("ItemT")
 EVENT_CHUNKS = 100  # latest chunks of a part whose events are shown for the time before following began
 GROWTH_STEP_NS = 10_000_000_000
 GROWTH_STEPS = 180  # half an hour
@@ -288,3 +295,77 @@ class LogFollower:
         """Close the file that is being read."""
         if self.part is not None:
             self.part.close()
+
+
+class LogListening(Generic[ItemT]):
+    """Follows a log in a thread of its own, for one task of an asyncio loop; an asynchronous context manager.
+
+    Args:
+        follower: belongs to the thread until the end.
+        look: makes the items of all that has become readable since its last call, which may be nothing.
+        poll_s: seconds between two looks.
+        overflow, queue_bytes: as in `swath.drivers.listening.Backlog`; the lane is the whole log's. A thread that waits
+            reads the file later: nothing is lost.
+    """
+
+    def __init__(
+        self,
+        follower: LogFollower,
+        look: Callable[[LogFollower], Iterator[Measured[ItemT]]],
+        *,
+        poll_s: float,
+        overflow: Overflow = Overflow.WAIT,
+        queue_bytes: int,
+    ) -> None:
+        self._follower, self._look, self._poll_s = follower, look, poll_s
+        self._reader: LoopReader[ItemT] = LoopReader(queue_bytes, overflow)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="follow", daemon=True)
+
+    async def __aenter__(self) -> Self:
+        """Begin to follow."""
+        self._thread.start()
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """Close the log and wait for the thread, also if the task was cancelled."""
+        await asyncio.shield(asyncio.to_thread(self.close))
+
+    def close(self) -> None:
+        """Close the log and wait for the thread."""
+        self._stop.set()
+        self._reader.backlog.close()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    async def take(self) -> ItemT | None:
+        """Wait for the item that came first; None: following has ended, and all items are taken.
+
+        Raises:
+            BusyError: another task waits for an item already.
+            Exception: what ``look`` failed with, after the items before it.
+        """
+        return await self._reader.take()
+
+    @property
+    def is_recorded(self) -> bool:
+        """True if a recording is under way, as far as the directory shows it."""
+        return self._follower.sign is not None
+
+    @property
+    def dropped(self) -> int:
+        """Number of units that were dropped because the reader was too slow."""
+        return self._reader.backlog.dropped(LOG)
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                for item in self._look(self._follower):
+                    self._reader.backlog.put(LOG, item)
+                    if self._stop.is_set():
+                        break
+                self._stop.wait(self._poll_s)
+        except Exception as error:
+            self._reader.backlog.fail(error)
+        finally:
+            self._follower.close()

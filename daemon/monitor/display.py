@@ -5,36 +5,81 @@ from __future__ import annotations
 import os
 import time
 from collections import deque
+from collections.abc import AsyncGenerator, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from swath.daemon.log.claim import is_being_written
-from swath.daemon.log.follow import LogFollower, PartFollower
+from swath.daemon.log.follow import LogFollower, LogListening, PartFollower
 from swath.daemon.log.format import LogError, SessionInfo, source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch, json_objects
 from swath.daemon.log.parsers import stored_config, stored_drivers
+from swath.daemon.log.parts import Sign
 from swath.daemon.log.session import read_boot_id
 from swath.daemon.log.words import duration_text, source_trouble
 from swath.daemon.monitor.source import Decoding, SourceWatch, decoded_trouble
+from swath.drivers.listening import Measured
 
 TAIL_S = 5.0
+QUEUE_BYTES = 16 << 20  # read, but not yet taken
 EVENTS_KEPT = 50
 STALE_S = 5.0  # a status is written each second; a disk may delay it
 LITTLE_LEFT_S = 900.0
 RECORDING, DEGRADED, NOT_RECORDING = "recording", "degraded", "not recording"
 
 
+@dataclass(frozen=True, slots=True)
+class News:
+    """Messages of the log, or the end of a look at it.
+
+    Attributes:
+        part: the file that is read; None: there is none yet.
+        batch: messages of it; None: all that could be read has been.
+        sign: of the directory; None: nothing is being recorded.
+        bytes_per_s: highest rate of the last half hour, at the end of a look.
+    """
+
+    part: PartFollower | None
+    batch: LogBatch | None
+    sign: Sign | None = None
+    bytes_per_s: float = 0.0
+
+
+def news(follower: LogFollower) -> Iterator[Measured[News]]:
+    """Look at a log once: yield what has become readable, then the end of this look."""
+    for batch in follower.poll():
+        size_bytes = batch.units.nbytes + batch.log_time_ns.nbytes
+        yield Measured(News(follower.part, batch), size_bytes, len(batch.units), size_bytes)
+    end = News(follower.part, None, follower.sign, follower.growth.highest_bytes_per_s())
+    yield Measured(end, 0, 0, 0)
+
+
+def follower_of(directory: Path) -> LogFollower:
+    """Return what reads the recording in a directory for a monitor."""
+    return LogFollower(directory, TAIL_S, every_part=False)
+
+
+async def watch(directory: Path, every_s: float, *, decode: bool = True) -> AsyncGenerator[Monitor, None]:
+    """Yield the monitor of a directory after each look at its log, every so many seconds."""
+    monitor = Monitor(directory, decode=decode)
+    async with LogListening(follower_of(directory), news, poll_s=every_s, queue_bytes=QUEUE_BYTES) as listening:
+        while (found := await listening.take()) is not None:
+            monitor.take(found)
+            if found.batch is None:
+                yield monitor
+
+
 class Monitor:
-    """Follows the recording in a directory; `poll` reads new data, `snapshot` gives the state."""
+    """Keeps the state of the recording in a directory; `take` takes what was read, `snapshot` gives the state."""
 
     def __init__(self, directory: Path, *, decode: bool = True) -> None:
-        """Prepare to follow; with ``decode``, run the sources' parsers, for rates of records, damaged messages and
-        gaps.
-        """
+        """Prepare; with ``decode``, run the sources' parsers, for rates of records, damaged messages and gaps."""
         self._directory = directory
         self._decode = decode
-        self._follower = LogFollower(directory, TAIL_S, every_part=False)
         self._part: PartFollower | None = None
+        self._sign: Sign | None = None
+        self._highest_bytes_per_s = 0.0
         self._sources: dict[str, SourceWatch] = {}
         self._inside: dict[str, list[str]] = {}  # devices by the stream that contains their data
         self._events: deque[dict[str, Any]] = deque(maxlen=EVENTS_KEPT)
@@ -42,27 +87,24 @@ class Monitor:
         self._reserve_bytes = 0
         self._damaged = 0
         self._newest_ns = 0
+        self._looked_ns: int | None = None  # newest time at the end of the last look; None: there was no file
         self._began_s = time.monotonic()
         self._grown_s: float | None = None  # when a message newer than those at the beginning was read
 
-    def close(self) -> None:
-        """Close the log."""
-        self._follower.close()
-
     # ------------------------------------------------------------------ reading
 
-    def poll(self) -> None:
-        """Read the data recorded since the last call; if nothing has been recorded yet, read the end of the
-        newest log.
-        """
-        begun, newest_ns = self._part is not None, self._newest_ns
-        for batch in self._follower.poll():
-            if self._follower.part is not self._part:
-                self._begin_part(self._follower.part)
-            self._take(batch)
-        if begun and self._newest_ns != newest_ns:
+    def take(self, found: News) -> None:
+        """Take messages or the end of a look; if nothing has been recorded yet, read the end of the newest log."""
+        if found.batch is not None:
+            if found.part is not self._part:
+                self._begin_part(found.part)
+            self._take(found.batch)
+            return
+        self._sign, self._highest_bytes_per_s = found.sign, found.bytes_per_s
+        if self._looked_ns is not None and self._newest_ns != self._looked_ns:
             self._grown_s = time.monotonic()
-        if self._part is None and self._follower.part is None:
+        self._looked_ns = None if self._part is None else self._newest_ns
+        if self._part is None and found.part is None:
             self._read_latest()
 
     def _begin_part(self, part: PartFollower | None) -> None:
@@ -127,7 +169,7 @@ class Monitor:
     def is_undecided(self) -> bool:
         """True if growth of the log could still prove a recording whose recorder cannot be asked."""
         waiting = self._grown_s is None and time.monotonic() - self._began_s < STALE_S
-        return waiting and self._follower.sign is not None and not _is_of_this_boot(self._follower.sign.boot_id)
+        return waiting and self._sign is not None and not _is_of_this_boot(self._sign.boot_id)
 
     def snapshot(self) -> dict[str, Any]:
         """Return the present state as plain values, the form of ``--json``."""
@@ -137,7 +179,7 @@ class Monitor:
         if why_not is not None:  # what they last did says nothing about now
             sources = {source: _stale(values) for source, values in sources.items()}
         rate = sum(values["bytes_per_s"] or 0.0 for values in sources.values())
-        room = self._room(max(rate, self._follower.growth.highest_bytes_per_s()))
+        room = self._room(max(rate, self._highest_bytes_per_s))
         troubles = self._troubles(sources, room) if why_not is None else [why_not]
         verdict = NOT_RECORDING if why_not is not None else DEGRADED if troubles else RECORDING
         found: dict[str, Any] = {
@@ -185,7 +227,7 @@ class Monitor:
         return {"free_bytes": free, "reserve_bytes": self._reserve_bytes, "hours_left": hours}
 
     def _why_not_recording(self, now_ns: int | None) -> str | None:
-        sign = self._follower.sign
+        sign = self._sign
         if sign is None:
             last = self._events[-1] if self._events else None
             reason = "" if last is None else f"; last event: {last.get('code')}: {last.get('text')}"

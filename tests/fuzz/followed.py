@@ -20,8 +20,8 @@ from swath.daemon.log.follow import LogFollower
 from swath.daemon.log.format import LogError
 from swath.daemon.log.parts import RECORDING_SIGN, read_sign
 from swath.daemon.log.reader import open_logs
-from swath.daemon.monitor.display import Monitor
 from swath.daemon.processing.live.follow import LiveFollower
+from tests.daemon.monitor.builders import Looking
 from tests.fuzz.engine import FindingError, Target
 from tests.fuzz.logs import BATCHES, INFO, VALUES, log_seeds, mutate_log
 from tests.fuzz.mcap_parts import MESSAGE, take_apart
@@ -87,7 +87,7 @@ def _polled(folder: Path) -> Iterator[str]:
 
 def _monitored(folder: Path) -> Iterator[str]:
     """Run `swath monitor` in both forms."""
-    monitor = Monitor(folder)
+    monitor = Looking(folder)
     monitor.poll()
     found = monitor.snapshot()
     monitor.close()

@@ -574,6 +574,12 @@ async def test_a_growing_log_is_followed_from_recording_to_recording(tmp_path: P
                             break
                     sessions.append(log.session_id)
                     assert log.status("scanner/left").state == "following"
+                    reported: dict[str, str] = {}
+                    async for source, _, values in log.reports():  # each second
+                        reported[source] = values["state"]
+                        if {"gnss/rover", "scanner/left"} <= set(reported):
+                            break
+                    assert set(reported.values()) <= {"receiving", "opening"}
                     assert await asyncio.to_thread(recorder.stop) == 0
                 await ended(lambda: log.status("gnss/rover").state == "waiting")
                 await ended(lambda: whole(log.status("scanner/left")))

@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
-import asyncio
 import math
 import threading
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from swath.daemon.config.config import Config
 from swath.daemon.devices.listening import QUEUE_BYTES, Batch, Status, Times, decoded_counts, row_count
 from swath.daemon.errors import ExitCode, UserError
-from swath.daemon.log.follow import LogFollower, PartFollower
+from swath.daemon.log.follow import LogFollower, LogListening, PartFollower
 from swath.daemon.log.format import LogError, SessionInfo, source_of_topic
 from swath.daemon.log.host_messages import feed_clocks
-from swath.daemon.log.mcap.chunks import LogBatch
+from swath.daemon.log.mcap.chunks import LogBatch, json_objects
 from swath.daemon.log.parsers import stored_config
 from swath.daemon.processing.navigation.observations import gps_times
 from swath.daemon.processing.navigation.times import GrowingCounter
 from swath.daemon.processing.points.runs import Run
 from swath.daemon.processing.records.tables import GUESSED_LEAP_S, NO_TIME_NS
 from swath.daemon.processing.setup.sources import Sources
-from swath.drivers.listening import LoopReader, Overflow
+from swath.drivers.listening import Measured, Overflow
 from swath.drivers.parser import DeviceKind
 from swath.georef.arrays import FloatArray, Int64Array, StructArray
 from swath.georef.records import (
@@ -46,7 +45,7 @@ from swath.georef.stream.clocks import DevicePlan, StreamClocks
 from swath.georef.timescales import SECOND_NS, WEEK_NS
 
 POLL_S = 0.05
-LOG = "log"  # the one lane of a log
+EVENTS, STATUS = "/events", "/status/"
 _EVERY_KIND: tuple[DeviceKind, ...] = ("gnss", "imu", "scanner", "corrections", "raw")
 
 
@@ -184,14 +183,13 @@ def live_clocks(config: Config, info: SessionInfo) -> LiveClocks:
     return LiveClocks(Sources(config, {}, sorted(config.scanner)), info)
 
 
-class LogListening:
-    """Follows the log that a recorder writes, in a thread of its own, for one task of an asyncio loop.
+class DecodedLog(LogListening[Batch]):
+    """Follows the log that a recorder writes and decodes it, for one task of an asyncio loop.
 
     Args:
         directory: of the recorder's logs.
         tail_s: how much of an already existing recording is read first.
-        overflow, queue_bytes: as in `swath.daemon.devices.listening.Listening`; the lane is the whole log's. A thread
-            that waits reads the file later: nothing is lost.
+        overflow, queue_bytes: as in `LogListening`.
 
     Attributes:
         session_id: of the recording that is followed; empty before the first.
@@ -205,44 +203,15 @@ class LogListening:
         overflow: Overflow = Overflow.WAIT,
         queue_bytes: int = QUEUE_BYTES,
     ) -> None:
+        follower = LogFollower(directory, tail_s)
+        super().__init__(follower, self._decoded, poll_s=POLL_S, overflow=overflow, queue_bytes=queue_bytes)
         self.session_id = ""
-        self._directory = directory
-        self._reader: LoopReader[Batch] = LoopReader(queue_bytes, overflow)
-        self._follower = LogFollower(directory, tail_s)
         self._part: PartFollower | None = None
         self._session: _SessionDecoder | None = None
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="follow", daemon=True)
-
-    async def __aenter__(self) -> Self:
-        """Begin to follow."""
-        self._thread.start()
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        """Close the log and wait for the thread, also if the task was cancelled."""
-        await asyncio.shield(asyncio.to_thread(self.close))
-
-    def close(self) -> None:
-        """Close the log and wait for the thread."""
-        self._stop.set()
-        self._reader.backlog.close()
-        if self._thread.ident is not None:
-            self._thread.join()
-
-    async def take(self) -> Batch | None:
-        """Wait for the batch that came first; None: following has ended, and all batches are taken.
-
-        Raises:
-            UserError: the log's configuration cannot be used.
-            BusyError: another task waits for a batch already.
-        """
-        return await self._reader.take()
 
     def status(self, source: str) -> Status:
         """Return state and counts of a source; its state is that of the log: following, or waiting for a recording."""
-        state = "waiting" if self._follower.sign is None else "following"
-        found = Status(source, state, dropped=self._reader.backlog.dropped(LOG))
+        found = Status(source, "following" if self.is_recorded else "waiting", dropped=self.dropped)
         return found if self._session is None else self._session.with_counts(found)
 
     @property
@@ -250,33 +219,22 @@ class LogListening:
         """Names of the devices in the log that is followed."""
         return [] if self._session is None else list(self._session.parsers)
 
-    def _run(self) -> None:
-        try:
-            while not self._stop.is_set():
-                for batch in self._follower.poll():
-                    self._take(batch)
-                    if self._stop.is_set():
-                        break
-                if self._session is not None:
-                    self._session.flush()
-                self._stop.wait(POLL_S)
-        except Exception as error:
-            self._reader.backlog.fail(error)
-        finally:
-            self._follower.close()
+    def _decoded(self, follower: LogFollower) -> Iterator[Measured[Batch]]:
+        """Yield batches of all that has become readable.
 
-    def _take(self, batch: LogBatch) -> None:
-        part = self._follower.part
-        if part is not self._part and part is not None:
-            self._part = part
-            if part.info.session_id != self.session_id:
-                self.session_id = part.info.session_id
-                self._session = _SessionDecoder(part, self._put)
+        Raises:
+            UserError: the log's configuration cannot be used.
+        """
+        for messages in follower.poll():
+            part = follower.part
+            if part is not self._part and part is not None:
+                self._part = part
+                if part.info.session_id != self.session_id:
+                    self.session_id, self._session = part.info.session_id, _SessionDecoder(part)
+            if self._session is not None:
+                yield from self._session.take(messages)
         if self._session is not None:
-            self._session.take(batch)
-
-    def _put(self, batch: Batch) -> None:
-        self._reader.backlog.put(LOG, batch.measured)
+            yield from self._session.flush()
 
 
 class _SessionDecoder:
@@ -286,7 +244,7 @@ class _SessionDecoder:
     others are decoded at once, because clocks depend on them.
     """
 
-    def __init__(self, part: PartFollower, put: Callable[[Batch], None]) -> None:
+    def __init__(self, part: PartFollower) -> None:
         try:
             config = stored_config(part.attachments)
             if config is None:
@@ -296,27 +254,37 @@ class _SessionDecoder:
         except (UserError, LogError) as error:
             raise UserError(f"{part.path}: {error}", ExitCode.IO) from error
         self._clocks = LiveClocks(self._sources, part.info)
-        self._put = put
+        self._made: list[Batch] = []
         self._units: Counter[str] = Counter()
         self._bytes: Counter[str] = Counter()
         self._records: dict[str, Counter[str]] = {source: Counter() for source in self.parsers}
         self._runs: dict[str, Run] = {}
 
-    def take(self, batch: LogBatch) -> None:
-        """Take messages of one channel."""
+    def take(self, batch: LogBatch) -> Iterator[Measured[Batch]]:
+        """Take messages of one channel; yield what is decoded."""
         if feed_clocks(batch, self._clocks, self._sources.edge_of):
             return
-        source = source_of_topic(batch.channel.topic)
-        if source is not None:
+        topic = batch.channel.topic
+        source = source_of_topic(topic)
+        if topic == EVENTS or topic.startswith(STATUS):
+            self._made.append(Batch(topic, [], {}, reports=list(json_objects(batch))))
+        elif source is not None:
             run = self._runs.setdefault(source, Run(partial(self._parse, source)))
             run.add(ChunkBatch(source, batch.log_time_ns, batch.units))
             if not source.startswith("scanner/"):
                 run.flush()
+        yield from self._decoded()
 
-    def flush(self) -> None:
-        """Decode the units that wait to be decoded together."""
+    def flush(self) -> Iterator[Measured[Batch]]:
+        """Decode the units that wait to be decoded together; yield what is decoded."""
         for run in self._runs.values():
             run.flush()
+        yield from self._decoded()
+
+    def _decoded(self) -> Iterator[Measured[Batch]]:
+        made, self._made = self._made, []
+        for batch in made:
+            yield batch.measured
 
     def _parse(self, wire: str, units: list[ChunkBatch]) -> None:
         batch, device = Batch(wire, units, {}), wire.removesuffix("/aux")
@@ -328,7 +296,7 @@ class _SessionDecoder:
             batch.times[source] = self._clocks.take(source, records)
             for record in records:
                 self._records[source][type(record).__name__] += row_count(record)
-        self._put(batch)
+        self._made.append(batch)
 
     def with_counts(self, status: Status) -> Status:
         """Return a source's status with its counts."""

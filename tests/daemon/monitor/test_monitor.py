@@ -31,7 +31,6 @@ from swath.daemon.log.mcap.encode import encode_block
 from swath.daemon.log.mcap.writer import PartWriter
 from swath.daemon.log.reader import open_logs
 from swath.daemon.log.session import read_boot_id
-from swath.daemon.monitor.display import Monitor
 from swath.daemon.monitor.source import Decoding
 from swath.drivers.parser import PacketParser
 from swath.drivers.scanner.srep.layout import SrepHeader, encode_datagram
@@ -50,6 +49,7 @@ from tests.daemon.builders import (
 )
 from tests.daemon.commands import swath
 from tests.daemon.log_check import read_log
+from tests.daemon.monitor.builders import Looking
 from tests.daemon.rig import HANGS_S, Recorder, disk_of, free_udp_port, session_table, wait_until
 from tests.daemon.wires import pty as serial_port
 
@@ -279,7 +279,7 @@ def test_the_log_of_another_computer_is_judged_by_its_growth(
         monkeypatch.delenv("SWATH_BOOT_ID")
         recorder.wait_said("device_opened")
         time.sleep(2.5)
-        monitor = Monitor(logs)
+        monitor = Looking(logs)
         monitor.poll()
         assert monitor.snapshot()["verdict"] == "not recording"
         assert monitor.is_undecided
@@ -316,7 +316,7 @@ def test_after_a_power_cut_and_restart_the_old_log_is_not_recording(tmp_path: Pa
 @pytest.mark.slow
 def test_after_a_kill_the_sources_are_stale(tmp_path: Path, logs: Path) -> None:
     port = free_udp_port()
-    monitor = Monitor(logs)
+    monitor = Looking(logs)
     with Recorder(tmp_path, session_table(logs) + scanner(port)) as recorder, srep_sender(port, 100.0):
         recorder.wait_said("device_opened")
 
@@ -482,7 +482,7 @@ def test_a_damaged_chunk_of_the_growing_log_degrades_the_verdict(tmp_path: Path)
     path.write_bytes(data[: len(data) // 2])
     sign = {"session_id": INFO.session_id, "part": 0, "path": path.name, "boot_id": "another"}
     (tmp_path / "recording.json").write_text(json.dumps(sign))
-    monitor = Monitor(tmp_path, decode=False)
+    monitor = Looking(tmp_path, decode=False)
     monitor.poll()
     path.write_bytes(data)
     monitor.poll()
@@ -610,7 +610,7 @@ def test_on_a_terminal_a_page_is_shown_until_ctrl_c_and_a_key_marks(tmp_path: Pa
 
 @pytest.mark.parametrize("columns", [80, 120])
 def test_the_page_fits_and_hides_no_number(tmp_path: Path, columns: int) -> None:
-    monitor = Monitor(tmp_path)
+    monitor = Looking(tmp_path)
     monitor.poll()
     found = monitor.snapshot()
     lost = {"lost_kernel": 12, "lost_queue": 0, "lost_write": 34567}

@@ -13,7 +13,6 @@ from swath.daemon.config import parse_config
 from swath.daemon.devices.check import check_everything
 from swath.daemon.errors import ConfigError
 from swath.daemon.log.reader import open_logs
-from swath.daemon.monitor.display import Monitor
 from swath.daemon.processing.navigation.log import read_navigation_log
 from swath.daemon.processing.navigation.sources import NavigationSources
 from swath.daemon.processing.points.clocks import read_clocks
@@ -23,6 +22,7 @@ from swath.drivers.scanner.livox.layout import IMU_2, NO_SYNC, POINTS_2, encode_
 from swath.georef.records import ImuSamples
 from tests.daemon.exchange.builders import Unit, write_config, write_log
 from tests.daemon.log_check import read_log
+from tests.daemon.monitor.builders import Looking
 from tests.daemon.rig import Recorder, free_udp_port, session_table
 from tests.daemon.wires import udp_sender
 from tests.drivers.livox_cases import FILES
@@ -92,7 +92,7 @@ def test_the_recorder_logs_it_once_and_the_monitor_shows_it(tmp_path: Path) -> N
     text = session_table(tmp_path / "logs") + HEAD.format("top", data, "mid360")
     text += f'auxiliary = "udp:127.0.0.1:{second}"\n' + INSIDE.format("top", "mid360")
     with udp_sender(data, points), udp_sender(second, sample), Recorder(tmp_path / "rig", text) as recorder:
-        monitor, shown = Monitor(tmp_path / "logs"), dict[str, Any]()
+        monitor, shown = Looking(tmp_path / "logs"), dict[str, Any]()
         until = time.monotonic() + 20
         while "ImuSamples" not in shown.get("imu/inner", {}).get("decoded", {}).get("records_hz", {}):
             assert time.monotonic() < until, shown
