@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from swath.daemon.processing.live.tiles import NO_DIFFERENCE, SIDE, Head, Place, pack_tile
-from swath.georef.arrays import FloatArray, Int64Array, StructArray, UInt64Array
+from swath.georef.arrays import FloatArray, Int64Array, SingleArray, StructArray, UInt64Array
 from swath.georef.compiled import jit_cached
 from swath.georef.points import Points
 from swath.georef.timescales.gps_time import SECOND_NS
@@ -170,6 +170,35 @@ class CellGrid:
         )
         return pack_tile(whole, stored)
 
+    def set_differences(self, across: int, up: int, fine_m: float, cell_m: float, dz_m: SingleArray) -> None:
+        """Set differences of strips; where there is one already, the larger remains.
+
+        Args:
+            across, up: column and row of the first cell, counted in cells of ``fine_m``, the grid's width at first.
+            fine_m: that width.
+            cell_m: side of the cells that were compared.
+            dz_m: (rows, columns) of these cells, metres; nan: not compared.
+        """
+        factor = round(self.cell_m / fine_m)
+        if cell_m > self.cell_m:
+            times = round(cell_m / self.cell_m)
+            dz_m = dz_m.repeat(times, axis=0).repeat(times, axis=1)
+        elif cell_m < self.cell_m:
+            times = min(round(self.cell_m / cell_m), len(dz_m))
+            dz_m = _means(dz_m, times)
+        column, row = across // factor, up // factor
+        slot = _take_tile(column >> _BITS, row >> _BITS, self._keys, self._slots, self._places, self._state)
+        if slot < 0:
+            return
+        left, low = column & (SIDE - 1), row & (SIDE - 1)
+        part = self._cells[slot, low : low + len(dz_m), left : left + dz_m.shape[1]]
+        millimetres = np.clip(np.rint(np.nan_to_num(dz_m) * 1000.0), NO_DIFFERENCE + 1, -NO_DIFFERENCE - 1)
+        before = np.where(part["compared"] > 0, np.abs(part["difference"].astype(np.int32)), -1)
+        better = np.isfinite(dz_m) & (np.abs(millimetres) > before)
+        part["difference"][better] = millimetres[better]
+        part["compared"][better] = 1
+        self._changed[slot] = 1
+
     def forget_strip(self, number: int) -> None:
         """Take a strip out of the cells: what it was turned out to be too short for one."""
         for slot in range(self.held):
@@ -235,6 +264,15 @@ class CellGrid:
             mean = (self.points - self.refused) / (cells * cell_m2)
             found["density_per_m2"] = {name: round(value, 3) for name, value in ({"mean": mean} | quantiles).items()}
         return found
+
+
+def _means(values: SingleArray, times: int) -> SingleArray:
+    """Return the means of known values in blocks of ``times`` by ``times``; nan where there are none."""
+    blocks = values.reshape(len(values) // times, times, values.shape[1] // times, times)
+    known = np.isfinite(blocks)
+    count = known.sum(axis=(1, 3))
+    total = np.where(known, blocks, 0.0).sum(axis=(1, 3))
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan).astype(np.float32)
 
 
 def _joined(tile: StructArray, shift: int) -> StructArray:

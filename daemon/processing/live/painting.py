@@ -15,10 +15,12 @@ from numpy.typing import NDArray
 
 from swath.daemon.processing.live.frame import LocalFrame
 from swath.daemon.processing.live.grid import CellGrid
+from swath.daemon.processing.live.strips import StripComparison, StripCutter
 from swath.daemon.processing.live.tiles import FILE_BYTES, INDEX, TILES, Head, Place, TileFolder, replace_file
 from swath.georef.arrays import ByteArray
 from swath.georef.points import Points
 from swath.georef.timescales.gps_time import SECOND_NS
+from swath.georef.trajectory.trajectory import Trajectory
 
 HERE, METRES = np.zeros(3), np.ones(3)  # origin and units of points that are in the frame ``local`` already
 IMAGE_CELLS = 2048
@@ -33,17 +35,30 @@ class LiveMap:
 
     Attributes:
         grid: its cells.
+        cutter: finds its strips.
+        comparison: compares the present strip with those before it.
         trouble: why tiles are missing in the folder, for people; empty: none are.
     """
 
-    def __init__(self, folder: Path, cell_m: float, quota_bytes: int) -> None:
-        """Begin an empty map; its tiles go to a folder below ``folder``, and take at most ``quota_bytes``."""
+    def __init__(
+        self, folder: Path, cell_m: float, quota_bytes: int, gps_from_host: Callable[[int], int | None]
+    ) -> None:
+        """Begin an empty map.
+
+        Args:
+            folder: its tiles go to a folder below this one.
+            cell_m: side of a cell.
+            quota_bytes: size that all tiles may have.
+            gps_from_host: gives GPS time of a host time; None: not known.
+        """
         self.grid = CellGrid(cell_m)
+        self.cutter = StripCutter(gps_from_host)
+        self.comparison = StripComparison(cell_m)
         self.trouble = ""
         self._folder, self._quota_bytes = folder, quota_bytes
         self._tiles: TileFolder | None = None
         self._coarsened = 0
-        self._saved_ns = 0
+        self._saved_ns = self._compared_ns = 0
 
     @property
     def sequence(self) -> int:
@@ -56,11 +71,34 @@ class LiveMap:
         return 0 if self._tiles is None else self._tiles.size
 
     def take(self, points: Points, frame: LocalFrame) -> None:
-        """Add points."""
+        """Add points to the cells, and to the comparison of strips."""
+        edges = self.cutter.edges()
+        xyz, origin, unit_m = points.points_map, frame.origin, frame.unit_m
         if frame.is_level:
-            self.grid.add(points, HERE, METRES, places=frame.of_points(points.points_map))
-        else:
-            self.grid.add(points, frame.origin, frame.unit_m)
+            xyz, origin, unit_m = frame.of_points(xyz), HERE, METRES
+        self.grid.add(points, origin, unit_m, edges, xyz)
+        self.comparison.take(points, xyz, origin, unit_m, edges, self.grid)
+
+    def update(self, trajectory: Trajectory, log_time_ns: int) -> None:
+        """Find strips in the trajectory so far, and compare the present one as far as it is complete."""
+        self.cutter.update(trajectory, log_time_ns)
+        while self.cutter.dropped:
+            number = self.cutter.dropped.pop()
+            self.grid.forget_strip(number)
+            self.comparison.drop(number)
+        if log_time_ns >= self._compared_ns + SECOND_NS and self.cutter.is_settled:
+            self._compared_ns = log_time_ns
+            self.comparison.update(int(trajectory.time_ns[-1]), self.grid)
+
+    def end(self) -> None:
+        """End the present strip, and compare the rest of it."""
+        self.cutter.end()
+        self.comparison.finish(self.grid)
+
+    def strips(self) -> list[dict[str, int]]:
+        """Return the strips so far in plain values; the last may be the present one."""
+        present = [] if self.cutter.open is None or not self.cutter.is_settled else [self.cutter.open]
+        return [strip.plain() for strip in [*self.cutter.strips, *present]]
 
     def is_due(self, log_time_ns: int) -> bool:
         """Return whether tiles have changed, and a second of log time has passed since they were written."""
@@ -76,7 +114,9 @@ class LiveMap:
             self._tiles.renew()
         self.trouble = ""
         try:
-            self._tiles.write(self._within_quota(self._tiles), {"cell_m": self.grid.cell_m, **about})
+            self._tiles.write(
+                self._within_quota(self._tiles), {"cell_m": self.grid.cell_m, "strips": self.strips(), **about}
+            )
         except OSError as error:
             self.trouble = f"{TILES}/{INDEX}: {error.strerror or error}: the map's tiles are not written"
 
@@ -96,6 +136,12 @@ class LiveMap:
         """
         counts, west_m, north_m, cell_m = self.grid.image(IMAGE_CELLS)
         numbers = self.grid.numbers() | about
+        numbers["strips"] = self.strips()
+        numbers["overlap"] = {
+            "cell_m": self.comparison.side_m,
+            **self.comparison.total.numbers(),
+            "pairs": self.comparison.pairs,
+        }
         numbers["picture"] = {
             "name": PICTURE,
             "west_m": west_m,

@@ -9,6 +9,7 @@ import json
 import math
 import os
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -101,8 +102,24 @@ class LiveProducts:
         trouble: why no files are written, for people; empty: they are.
     """
 
-    def __init__(self, folder: Path, live: LiveConfig, mapping: Maps | None, reserve_bytes: int, about: str) -> None:
-        """Prepare the folder; ``about`` describes the mapping frame for people.
+    def __init__(
+        self,
+        folder: Path,
+        live: LiveConfig,
+        mapping: Maps | None,
+        reserve_bytes: int,
+        about: str,
+        gps_from_host: Callable[[int], int | None] = lambda host_ns: None,
+    ) -> None:
+        """Prepare the folder.
+
+        Args:
+            folder: where files go.
+            live: settings.
+            mapping: the mapping frame of the points; None: e.
+            reserve_bytes: the recorder's reserve of free space.
+            about: describes the mapping frame for people.
+            gps_from_host: gives GPS time of a host time; None: not known.
 
         Raises:
             OSError: the folder cannot be written to.
@@ -113,7 +130,7 @@ class LiveProducts:
         self.trouble = ""
         self.room = Room(folder, 2 * reserve_bytes)
         self.frame: LocalFrame | None = None
-        self.map = LiveMap(folder, live.cell_m, int(TILES_SHARE * live.live_quota_mb * 1e6))
+        self.map = LiveMap(folder, live.cell_m, int(TILES_SHARE * live.live_quota_mb * 1e6), gps_from_host)
         self._folder, self._live, self._mapping, self._about = folder, live, mapping, about
         self._thinning = Thinning(live.points_per_s)
         self._mcap: LiveMcap | None = None
@@ -133,6 +150,8 @@ class LiveProducts:
         self.begin(trajectory)
         if self.frame is None:
             return
+        if trajectory is not None:
+            self.map.update(trajectory, log_time_ns)
         self.map.take(points, self.frame)
         keep = self._thinning.keep(points.time_ns)
         count = len(keep)
@@ -147,6 +166,7 @@ class LiveProducts:
         """Write the newest pose, at most ten times a second of log time; the first one lays the frame."""
         if trajectory is None or log_time_ns < self._pose_ns + POSE_NS:
             return
+        self.map.update(trajectory, log_time_ns)
         self.begin(trajectory)
         if self.frame is None:
             return

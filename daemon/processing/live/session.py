@@ -12,6 +12,8 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from swath.daemon.config.tables import LiveConfig
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.log.format import SessionInfo
@@ -101,7 +103,7 @@ class LiveSession:
             )
         reserve_bytes = int(setup.config.session.reserve_mb * 1e6)
         about = setup.options.crs or setup.config.output.crs or "EPSG:4978 (no [output] crs)"
-        self.products = LiveProducts(folder, live, setup.mapping, reserve_bytes, about)
+        self.products = LiveProducts(folder, live, setup.mapping, reserve_bytes, about, self._gps_from_host)
         self.status = LiveStatus(setup, self._stream, self.products)
         self.points: PointsFile | None = None
         if points is not None:
@@ -113,12 +115,25 @@ class LiveSession:
         """Take the next messages."""
         self.now_ns = max(self.now_ns, int(batch.log_time_ns[-1]))
         self.status.note_batch(batch, self.host_now_ns(live=live))
+        if batch.channel.chunk_class == "scanner":
+            self.products.map.cutter.note_laser(int(batch.log_time_ns[0]), int(batch.log_time_ns[-1]))
         placed = self._feed.take(batch)
         self.status.navigation = None if self._feed.navigator is None else self._feed.navigator.state
         if placed:
             self._give(placed, live=live)
         self.products.take_pose(self._path.trajectory, self.now_ns)
         self.products.save_map({"session_id": self.info.session_id}, self.now_ns)
+
+    def _gps_from_host(self, host_ns: int) -> int | None:
+        """Return the GPS time of a host time by the clock of the first scanner that has one; None: there is none."""
+        host = self._stream.clocks.host
+        for name in self._stream.scanners:
+            device = host.plan.devices.get(f"scanner/{name}")
+            if device is not None:
+                gps_ns, sigma_ns = host.gps_from_host(device.clock, np.array([host_ns]))
+                if np.isfinite(sigma_ns[0]):
+                    return int(gps_ns[0])
+        return None
 
     def host_now_ns(self, *, live: bool) -> int:
         """Return the session's host time; if another computer recorded it, the time of the last message read."""
@@ -137,6 +152,7 @@ class LiveSession:
         """Flush the points that still wait at the log's end, and close the files."""
         self._give(self._feed.close(), live=live)
         self.look_for_room()
+        self.products.map.end()
         self.products.save_map({"session_id": self.info.session_id}, self.now_ns, last=True)
         self.products.close()
         if self.points is not None:

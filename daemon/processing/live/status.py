@@ -138,6 +138,7 @@ class LiveStatus:
             },
             "time": self._clock_states(now_ns),
             "trajectory": {"source": self._trajectory_source, "covered_until_gps_ns": stream.path.covered_until_ns},
+            "overlap": products.map.comparison.present(),
             "live_mcap": {"points_written": products.shown, "points_not_written": products.unwritten},
             "free_bytes": products.room.free_bytes,
             "stops_writing_at_bytes": products.room.least_bytes,

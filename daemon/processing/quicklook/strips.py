@@ -250,7 +250,7 @@ class StripCells:
                 densities.append(0.0)
                 continue
             moments = self.moments[self.tiles[strip].ravel()[shared[strip]], :, :2]
-            densities.append(_open_density(moments, self.frame.cell_m))
+            densities.append(open_density(moments, self.frame.cell_m))
         return densities
 
     def pulse_density(self) -> tuple[float, float]:
@@ -303,7 +303,7 @@ class StripCells:
         ups, acrosses = np.nonzero((self.tiles[first] >= 0) & (self.tiles[second] >= 0))
         a, b = (self.moments[self.tiles[strip, ups, acrosses]] for strip in (first, second))
         tile, inside = np.nonzero((a[:, :, 1] >= FEWEST_RETURNS) & (b[:, :, 1] >= FEWEST_RETURNS))
-        plane_a, plane_b = (_planes(one[tile, inside], self.frame.cell_m) for one in (a, b))
+        plane_a, plane_b = (planes_of(one[tile, inside], self.frame.cell_m) for one in (a, b))
         keep = plane_a.smooth & plane_b.smooth
         if not keep.any():
             return None
@@ -316,8 +316,9 @@ class StripCells:
 
 
 @dataclass(frozen=True, slots=True)
-class _Planes:
-    """Planes (n,) through cells' returns: centroid, gradient, and whether the surface is smooth.
+class Planes:
+    """Planes (n,) through cells' returns: centroid, counted from the cell's centre, gradient, and whether the surface
+    is smooth.
 
     ``level``: gentle, with returns that spread over the cell; ``smooth``: in addition their scatter ``variance_m2`` is
     small.
@@ -335,6 +336,7 @@ class _Planes:
     spread_m2: tuple[FloatArray, FloatArray, FloatArray]  # second moments about the centroid: xx, xy, yy
 
     def height(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
+        """Return the heights (n,) of the planes at places counted from the cells' centres."""
         return self.z_m + self.east * (x_m - self.x_m) + self.north * (y_m - self.y_m)
 
     def height_variance(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
@@ -346,8 +348,8 @@ class _Planes:
         return np.asarray(np.maximum(self.variance_m2, typical) * (1.0 + np.maximum(lever, 0.0)) / self.count)
 
 
-def _planes(moments: FloatArray, cell_m: float) -> _Planes:
-    """Return least squares planes of cells (n, MOMENTS)."""
+def planes_of(moments: FloatArray, cell_m: float) -> Planes:
+    """Return least squares planes of cells (n, MOMENTS) of a side, each with more than three single returns."""
     n = moments[:, 1]
     x, y, z, xx, xy, yy, xz, yz, zz = (moments[:, 2:] / n[:, np.newaxis]).T
     xx, xy, yy, xz, yz, zz = xx - x * x, xy - x * y, yy - y * y, xz - x * z, yz - y * z, zz - z * z
@@ -358,7 +360,7 @@ def _planes(moments: FloatArray, cell_m: float) -> _Planes:
     variance = np.maximum(zz - east * xz - north * yz, 0.0) * n / (n - 3.0)
     gentle = np.hypot(east, north) <= math.tan(math.radians(STEEPEST_DEG))
     smooth = spread & gentle & (variance <= ROUGHEST_M**2)
-    return _Planes(x, y, z, east, north, spread & gentle, smooth, variance, n, (xx, xy, yy))
+    return Planes(x, y, z, east, north, spread & gentle, smooth, variance, n, (xx, xy, yy))
 
 
 def _pooled(counts: NDArray[Any]) -> NDArray[Any]:
@@ -369,7 +371,7 @@ def _pooled(counts: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(even.reshape(rows, 2, columns, 2).sum(axis=(1, 3)))
 
 
-def _open_density(moments: FloatArray, cell_m: float) -> float:
+def open_density(moments: FloatArray, cell_m: float) -> float:
     """Return single returns per square metre on open ground of tiles (n, 256, 2): pulses and single returns."""
     block = 1
     while True:
@@ -403,9 +405,18 @@ def strip_frame(low_m: FloatArray, high_m: FloatArray, cell_m: float | None = No
 
 def _halved(moments: FloatArray, cell_m: float) -> FloatArray:
     """Return tiles (…, 256, MOMENTS) as quarters (…, 8, 8, MOMENTS) of tiles with cells twice as large."""
-    tiles = moments.shape[:-2]
-    cells = moments.reshape(*tiles, TILE, TILE, MOMENTS)
-    made = np.zeros((*tiles, TILE // 2, TILE // 2, MOMENTS))
+    return merged(moments.reshape(*moments.shape[:-2], TILE, TILE, MOMENTS), cell_m)
+
+
+def merged(cells: FloatArray, cell_m: float) -> FloatArray:
+    """Return moments of cells (…, rows, columns, MOMENTS), both even, joined two by two about the centre of the four.
+
+    Args:
+        cells: moments about the centre of each cell.
+        cell_m: side of these cells.
+    """
+    rows, columns = cells.shape[-3:-1]
+    made = np.zeros((*cells.shape[:-3], rows // 2, columns // 2, MOMENTS))
     for up in range(2):
         for across in range(2):
             part = cells[..., up::2, across::2, :]
