@@ -12,14 +12,17 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from swath.daemon.processing.live.mcap import CLOUD_DTYPE
+from swath.daemon.processing.live.tiles import fit_placement
 from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.compiled import jit_cached
-from swath.georef.geodesy.earth import geodetic_from_e, rot_e_from_l
+from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e, rot_e_from_l
 from swath.georef.geodesy.vectors import rot_of
 from swath.georef.points import Points
 
 ORIGIN_STEP = 100.0  # the origin's coordinates are whole hundreds, which are easy to add in one's head
 STEP_M = 10.0  # steps along the body's axes, to find their direction on the map
+PLACED_M, PLACED_STEPS = 80_000.0, 9
+EARTH_M = 6.371e6
 POLAR_STEPS = 10  # iterations that suffice for a map's scale of up to ten
 _ENU_OF_L = [1, 0, 2]
 _ENU_SIGNS = np.array([1.0, 1.0, -1.0])
@@ -53,7 +56,7 @@ class LocalFrame:
 
     def __init__(self, position_e: FloatArray, mapping: Maps | None) -> None:
         """Place the frame at ``position_e`` (3,), the first position."""
-        self._mapping = mapping
+        self._mapping, self._position_e = mapping, position_e
         self.is_level = mapping is None or bool(CRS.from_wkt(mapping.wkt).is_geocentric)
         self.unit_m: FloatArray = np.ones(3) if mapping is None else mapping.unit_m
         self.origin: FloatArray = self._mapped(position_e[np.newaxis])[0].copy()
@@ -66,6 +69,22 @@ class LocalFrame:
 
     def _mapped(self, points_e: FloatArray) -> FloatArray:
         return points_e if self._mapping is None else self._mapping.map_from_e(points_e)
+
+    def placement(self) -> dict[str, Any] | None:
+        """Return polynomials between the frame and latitude and longitude: `tiles.Placement`; None: none can be made.
+
+        They are fitted to a square of `PLACED_M` about the first position, at its height.
+        """
+        lat, lon, height = (float(value) for value in geodetic_from_e(self._position_e))
+        steps = np.linspace(-0.5, 0.5, PLACED_STEPS) * PLACED_M / EARTH_M
+        up, across = (grid.ravel() for grid in np.meshgrid(steps, steps / max(math.cos(lat), 0.02), indexing="ij"))
+        try:
+            local = self.of_points(self._mapped(e_from_geodetic(lat + up, lon + across, np.full(len(up), height))))
+        except ValueError:  # the frame ends nearby
+            return None
+        here = math.degrees(lat), math.degrees(lon)
+        middle = self.of_points(self._mapped(self._position_e[np.newaxis]))[0, :2]
+        return fit_placement(here, np.degrees(np.stack([up, across], axis=-1)), middle, local[:, :2])
 
     def of_points(self, points: FloatArray) -> FloatArray:
         """Return local coordinates (n, 3) of points as the georeferencer gives them."""

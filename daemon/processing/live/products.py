@@ -18,6 +18,7 @@ import numpy as np
 
 from swath.daemon.config.tables import LiveConfig
 from swath.daemon.processing.live.frame import LocalFrame, Maps
+from swath.daemon.processing.live.look import PROFILE, LastLook
 from swath.daemon.processing.live.mcap import NAME, LiveMcap, LivePose
 from swath.daemon.processing.live.painting import COVERAGE, LiveMap
 from swath.georef.arrays import Int64Array
@@ -99,6 +100,7 @@ class LiveProducts:
     Attributes:
         points: number of points by scanner; ``shown``: written to live.mcap; ``unwritten``: thinned but not written.
         map: the map of cells, with its tiles.
+        look: the last moments.
         trouble: why no files are written, for people; empty: they are.
     """
 
@@ -131,6 +133,9 @@ class LiveProducts:
         self.room = Room(folder, 2 * reserve_bytes)
         self.frame: LocalFrame | None = None
         self.map = LiveMap(folder, live.cell_m, int(TILES_SHARE * live.live_quota_mb * 1e6), gps_from_host)
+        self.look = LastLook()
+        self._trajectory: Trajectory | None = None
+        self._placement: dict[str, Any] | None = None
         self._folder, self._live, self._mapping, self._about = folder, live, mapping, about
         self._thinning = Thinning(live.points_per_s)
         self._mcap: LiveMcap | None = None
@@ -157,6 +162,7 @@ class LiveProducts:
         count = len(keep)
         if count:
             cloud = self.frame.cloud_of(points, keep)
+            self.look.take(name, points, keep, cloud)
             time_ns = unix_from_gps(int(points.time_ns[keep[0]]))
             written = self._write(lambda mcap: mcap.add_cloud(f"/points/{name}", cloud, time_ns, log_time_ns))
             self.shown += count * written
@@ -174,6 +180,8 @@ class LiveProducts:
         position_e = trajectory.position_e[-1]
         position, q_local_from_b = self.frame.pose_of(position_e, trajectory.q_e_from_b[-1])
         lat, lon, height = geodetic_from_e(position_e)
+        self._trajectory = trajectory
+        self.look.take_pose(int(trajectory.time_ns[-1]), position)
         pose = LivePose(
             unix_from_gps(int(trajectory.time_ns[-1])),
             math.degrees(lat),
@@ -188,10 +196,48 @@ class LiveProducts:
     def save_map(self, latest: dict[str, Any], log_time_ns: int, *, last: bool = False) -> None:
         """Write the map's changed tiles, at most once a second of log time unless they are the ``last``."""
         due = self.map.grid.has_changed if last else self.map.is_due(log_time_ns)
-        if due and self._has_space:
-            self.map.save(log_time_ns, self.origin() | latest)
-            if self._mcap is not None:
-                self._mcap.beside_bytes = self.map.file_bytes
+        if not due or not self._has_space:
+            return
+        if self._placement is None and self.frame is not None:
+            self._placement = {"placement": self.frame.placement()}
+        self.map.save(log_time_ns, self.origin() | (self._placement or {}) | latest)
+        if self._mcap is not None:
+            self._mcap.beside_bytes = self.map.file_bytes
+        try:
+            self.look.save(self._folder, self.map.cutter.edges(), self.map.comparison.heights)
+        except OSError as error:
+            self.map.trouble = f"{PROFILE}: {error.strerror or error}: the last moments are not written"
+
+    def pose(self) -> dict[str, Any] | None:
+        """Return the newest pose for people; None: there is none.
+
+        ``lat_deg``, ``lon_deg`` and ``height_m`` are ellipsoidal; ``east_m``, ``north_m`` and ``up_m`` in the frame
+        ``local``; ``heading_deg`` and ``track_deg`` from true north, ``map_heading_deg`` from that of the map;
+        ``sigma_m`` is that of north, east, down, None: not known.
+        """
+        if self._trajectory is None or self.frame is None:
+            return None
+        last = self._trajectory.between(int(self._trajectory.time_ns[-1]), int(self._trajectory.time_ns[-1]))
+        lat, lon, height = (float(values[-1]) for values in last.geodetic())
+        roll, pitch, heading = (round(math.degrees(float(angle[-1])), 3) for angle in last.attitude())
+        north, east, _ = last.velocity_l()[-1].tolist()
+        position, q = self.frame.pose_of(last.position_e[-1], last.q_e_from_b[-1])
+        nose_east, nose_north = 1.0 - 2.0 * (q[2] ** 2 + q[3] ** 2), 2.0 * (q[1] * q[2] + q[0] * q[3])
+        sigma_m = last.position_sigma_l[-1]
+        return {
+            "gps_ns": int(last.time_ns[-1]),
+            "lat_deg": round(math.degrees(lat), 9),
+            "lon_deg": round(math.degrees(lon), 9),
+            "height_m": round(height, 3),
+            **dict(zip(("east_m", "north_m", "up_m"), np.round(position, 3).tolist(), strict=True)),
+            "roll_deg": roll,
+            "pitch_deg": pitch,
+            "heading_deg": heading,
+            "map_heading_deg": round(math.degrees(math.atan2(nose_east, nose_north)) % 360.0, 3),
+            "track_deg": _known(math.degrees(math.atan2(east, north)) % 360.0),
+            "speed_mps": _known(math.hypot(east, north)),
+            "sigma_m": np.round(sigma_m, 4).tolist() if np.isfinite(sigma_m).all() else None,
+        }
 
     @property
     def _has_space(self) -> bool:
@@ -255,3 +301,7 @@ class LiveProducts:
                 mcap.close()
             except OSError as error:
                 self.trouble = f"{NAME}: {error.strerror or error}: the file has no index"
+
+
+def _known(value: float) -> float | None:
+    return round(value, 3) if math.isfinite(value) else None

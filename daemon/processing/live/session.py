@@ -104,7 +104,7 @@ class LiveSession:
         reserve_bytes = int(setup.config.session.reserve_mb * 1e6)
         about = setup.options.crs or setup.config.output.crs or "EPSG:4978 (no [output] crs)"
         self.products = LiveProducts(folder, live, setup.mapping, reserve_bytes, about, self._gps_from_host)
-        self.status = LiveStatus(setup, self._stream, self.products)
+        self.status = LiveStatus(setup, self._stream, self.products, self._feed.fixes)
         self.points: PointsFile | None = None
         if points is not None:
             room = Room(points.parent, 2 * reserve_bytes) if beside_recorder else None

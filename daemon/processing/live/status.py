@@ -7,6 +7,7 @@ from __future__ import annotations
 import json
 import time
 from collections import Counter, deque
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from swath.daemon.processing.points.time_checks import time_trouble
 from swath.daemon.processing.setup.setup import Setup
 from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.points import FATE_NAMES
+from swath.georef.records import GnssFix
 from swath.georef.stream.stream import Stream
 
 STATUS = "live.json"
@@ -62,8 +64,11 @@ class LiveStatus:
         navigation: what the navigator waits for, or how it began, in words; None: the device's own INS is used.
     """
 
-    def __init__(self, setup: Setup, stream: Stream, products: LiveProducts) -> None:
+    def __init__(
+        self, setup: Setup, stream: Stream, products: LiveProducts, fixes: Mapping[str, GnssFix] | None = None
+    ) -> None:
         self.navigation: str | None = None
+        self._fixes_seen = {} if fixes is None else fixes
         self._setup, self._stream, self._products = setup, stream, products
         self._pulse: dict[str, Latencies] = {}
         self._log: dict[str, Latencies] = {}
@@ -138,6 +143,9 @@ class LiveStatus:
             },
             "time": self._clock_states(now_ns),
             "trajectory": {"source": self._trajectory_source, "covered_until_gps_ns": stream.path.covered_until_ns},
+            "pose": products.pose(),
+            "ground": products.look.ground(),
+            "gnss": {source: fix_in_words(fix, now_ns) for source, fix in sorted(self._fixes_seen.items())},
             "overlap": products.map.comparison.present(),
             "live_mcap": {"points_written": products.shown, "points_not_written": products.unwritten},
             "free_bytes": products.room.free_bytes,
@@ -180,6 +188,23 @@ class LiveStatus:
             sigma_ns = round(status.sigma_ns, 1) if np.isfinite(status.sigma_ns) else None
             states[source] = {"state": status.state.name, "sigma_ns": sigma_ns}
         return states
+
+
+def fix_in_words(fix: GnssFix, now_ns: int) -> dict[str, Any]:
+    """Return a receiver's newest position for people, at a host time.
+
+    ``sigma_m`` is that of north, east, down; it and ``satellites`` are None where the receiver does not give them.
+    """
+    sigma_m = None
+    if fix.position_cov_l is not None and np.isfinite(fix.position_cov_l.diagonal()).all():
+        sigma_m = np.round(np.sqrt(np.maximum(fix.position_cov_l.diagonal(), 0.0)), 4).tolist()
+    return {
+        "fix": fix.fix_type.name.lower(),
+        "valid": fix.valid,
+        "satellites": fix.satellites,
+        "sigma_m": sigma_m,
+        "age_s": round((now_ns - fix.host_time_ns) * 1e-9, 3),
+    }
 
 
 def sentence(found: dict[str, Any]) -> str:

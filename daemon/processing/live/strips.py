@@ -328,6 +328,30 @@ class StripComparison:
         self._against.clear()
         self._number = 0
 
+    def heights(self, places: FloatArray) -> tuple[FloatArray, Int64Array]:
+        """Return the heights (n,) above the origin of earlier strips' planes at places (n, 2), nan where there is none,
+        and the numbers (n,) of these strips.
+        """
+        up_m, numbers = np.full(len(places), np.nan), np.zeros(len(places), np.int64)
+        cells = places / self._side_m
+        across, up = (np.floor(cells[:, axis]).astype(np.int64) for axis in (0, 1))
+        side = SIDE >> self._levels
+        tiles = np.stack([across // side, up // side], axis=-1)
+        for column, row in np.unique(tiles, axis=0).tolist():
+            kept = self._planes.get((column, row))
+            if kept is None:
+                continue
+            own = np.flatnonzero((tiles[:, 0] == column) & (tiles[:, 1] == row))
+            planes = kept[up[own] % side, across[own] % side]
+            x, y = (cells[own, axis] - np.floor(cells[own, axis]) - 0.5 for axis in (0, 1))
+            east, north = planes["east"].astype(np.float64), planes["north"].astype(np.float64)
+            level = planes["height"] + self._side_m * (
+                east * (x - planes["x"] / 256.0) + north * (y - planes["y"] / 256.0)
+            )
+            up_m[own] = np.where(planes["strip"] > 0, level, np.nan)
+            numbers[own] = planes["strip"]
+        return up_m, numbers
+
     def present(self) -> dict[str, Any]:
         """Return the figures of the present strip: against all strips before it, and against each."""
         both = Spread()

@@ -63,6 +63,7 @@ LAYERS = {
 SUMMED = ("points", "pulses", "no_return")
 KEPT_FROM = 4  # cells on a side that one cell of the reader's smallest kept view stands for
 DIRECT_TILES = 64  # tiles whose files one view in full resolution reads at most; more cells are joined instead
+POWERS = [(first, total - first) for total in range(4) for first in range(total, -1, -1)]  # of a placement's terms
 Place = tuple[int, int]  # column and row of a tile, counted from the origin
 Layers = dict[str, NDArray[Any]]
 
@@ -386,6 +387,79 @@ class TileReader:
                 self._joined.popitem(last=False)
         self._joined.move_to_end(place)
         return kept[2][step]
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Converts between the frame ``local`` and latitude and longitude, by the polynomials of the index.
+
+    Attributes:
+        lat_deg, lon_deg: the place that angles count from.
+        east_m, north_m: the same place in the frame ``local``.
+        to_geodetic: coefficients (2, 10) of latitude and longitude, degrees, for east and north in kilometres.
+        to_local: coefficients (2, 10) of east and north, kilometres, for latitude and longitude in degrees.
+    """
+
+    lat_deg: float
+    lon_deg: float
+    east_m: float
+    north_m: float
+    to_geodetic: NDArray[np.float64]
+    to_local: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, index: Mapping[str, Any]) -> Placement | None:
+        """Return the placement that an index gives; None: it gives none."""
+        try:
+            said = index["placement"]
+            lat, lon = (float(value) for value in said["about_deg"])
+            east, north = (float(value) for value in said["about_m"])
+            both = [np.asarray(said[key], np.float64).reshape(2, len(POWERS)) for key in ("to_geodetic", "to_local")]
+        except (KeyError, TypeError, ValueError):
+            return None
+        return cls(lat, lon, east, north, both[0], both[1])
+
+    def geodetic(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return latitudes and longitudes (n, 2), degrees, of places (n, 2), east and north, metres."""
+        away = (places - (self.east_m, self.north_m)) / 1000.0
+        return np.asarray(_terms(away) @ self.to_geodetic.T + (self.lat_deg, self.lon_deg))
+
+    def local(self, geodetic: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return places (n, 2), east and north, metres, of latitudes and longitudes (n, 2), degrees."""
+        away = geodetic - (self.lat_deg, self.lon_deg)
+        away[:, 1] = (away[:, 1] + 180.0) % 360.0 - 180.0
+        return np.asarray(1000.0 * (_terms(away) @ self.to_local.T) + (self.east_m, self.north_m))
+
+
+def fit_placement(
+    about_deg: tuple[float, float],
+    away_deg: NDArray[np.float64],
+    about_m: NDArray[np.float64],
+    places_m: NDArray[np.float64],
+) -> dict[str, Any]:
+    """Return polynomials of third degree through places, as the index has them.
+
+    Args:
+        about_deg: latitude and longitude that angles count from.
+        away_deg: (n, 2) latitudes and longitudes from there.
+        about_m: (2,) the same place in the frame ``local``.
+        places_m: (n, 2) places in the frame.
+    """
+    away_km = (places_m - about_m) / 1000.0
+    to_geodetic = np.linalg.lstsq(_terms(away_km), away_deg, rcond=None)[0].T
+    to_local = np.linalg.lstsq(_terms(away_deg), away_km, rcond=None)[0].T
+    misfit_m = 1000.0 * np.abs(_terms(away_deg) @ to_local.T - away_km).max()
+    return {
+        "about_deg": list(about_deg),
+        "about_m": about_m.tolist(),
+        "to_geodetic": to_geodetic.tolist(),
+        "to_local": to_local.tolist(),
+        "misfit_m": round(float(misfit_m), 4),
+    }
+
+
+def _terms(pairs: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.stack([pairs[:, 0] ** first * pairs[:, 1] ** second for first, second in POWERS], axis=-1)
 
 
 def joined(layers: Layers, step: int) -> Layers:

@@ -24,7 +24,15 @@ from swath.daemon.processing.setup.setup import Setup
 from swath.drivers.parser import Parser
 from swath.georef.arrays import BoolArray, StructArray
 from swath.georef.points import Points
-from swath.georef.records import ChunkBatch, DeviceClockSamples, InsSolution, Record, ScannerReturns, TimeMessage
+from swath.georef.records import (
+    ChunkBatch,
+    DeviceClockSamples,
+    GnssFix,
+    InsSolution,
+    Record,
+    ScannerReturns,
+    TimeMessage,
+)
 from swath.georef.stream.stream import CONTEXT_FLAG, Stream
 from swath.georef.trajectory.buffer import SOLUTION_STATUS
 
@@ -47,11 +55,13 @@ class LogFeed:
 
     Attributes:
         counts: by source, number of records taken and of those left out.
+        fixes: by source, the newest position of its first antenna.
     """
 
     def __init__(self, setup: Setup, stream: Stream) -> None:
         self.stream = stream
         self.counts: dict[str, Counter[str]] = {}
+        self.fixes: dict[str, GnssFix] = {}
         self._setup = setup
         self._parsers = setup.sources.parsers(("gnss", "scanner")) | setup.sources.ins_parser()
         # for a growing log, until the device's own INS has a solution
@@ -196,6 +206,8 @@ class LogFeed:
                 rows = np.flatnonzero(record.rows["number_of_returns"])  # the others are pulses without a return
             # 228
             counts[type(record).__name__] += 1 if rows is None else len(rows)
+            if isinstance(record, GnssFix) and record.lat_rad is not None and record.antenna == "primary":
+                self.fixes[source] = record
             if isinstance(record, ScannerReturns):
                 self._take_returns(source, record.rows)
             elif isinstance(record, TimeMessage) and source in clocks.host.plan.gnss:

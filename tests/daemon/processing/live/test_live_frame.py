@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from pyproj import CRS
+from pyproj import CRS, Transformer
 from scipy.spatial.transform import Rotation
 
 from swath.daemon.config.tables import LiveConfig
@@ -15,8 +16,9 @@ from swath.daemon.processing.live.frame import LocalFrame
 from swath.daemon.processing.live.mcap import NAME
 from swath.daemon.processing.live.points import PointsFile
 from swath.daemon.processing.live.products import LiveProducts, Room
+from swath.daemon.processing.live.tiles import Placement
 from swath.georef.timescales.gps_time import SECOND_NS
-from tests.daemon.processing.live.builders import Utm, flight, points_at, read_back
+from tests.daemon.processing.live.builders import HEIGHT_M, LAT_DEG, LON_DEG, Utm, flight, points_at, read_back
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -34,6 +36,30 @@ class TestFrame:
         _, q = frame.pose_of(trajectory.position_e[0], trajectory.q_e_from_b[0])
         nose = Rotation.from_quat(np.roll(q, -1)).apply([1, 0, 0])
         np.testing.assert_allclose(nose, [np.sqrt(0.5), np.sqrt(0.5), 0], atol=1e-9)
+
+    @pytest.mark.parametrize("maps", [Utm(), None], ids=["UTM", "level"])
+    def test_polynomials_place_the_map_by_latitude_and_longitude(self, maps: Utm | None) -> None:
+        """PROJ maps places within 30 km; readers of the map do without it."""
+        trajectory = flight()
+        frame = LocalFrame(trajectory.position_e[0], maps)
+        index = json.loads(json.dumps({"placement": frame.placement()}))
+        placement = Placement.of(index)
+        assert placement is not None
+        rng = np.random.default_rng(3)
+        lat_lon = np.array([LAT_DEG, LON_DEG]) + rng.uniform((-0.27, -0.4), (0.27, 0.4), (200, 2))
+        position_e = np.stack(
+            Transformer.from_crs("EPSG:4979", "EPSG:4978", always_xy=True).transform(
+                lat_lon[:, 1], lat_lon[:, 0], np.full(200, HEIGHT_M)
+            ),
+            axis=-1,
+        )
+        local = frame.of_points(position_e if maps is None else maps.map_from_e(position_e))[:, :2]
+        assert np.abs(local).max() > 25_000
+        np.testing.assert_allclose(placement.local(lat_lon), local, rtol=0, atol=0.1)
+        np.testing.assert_allclose(placement.geodetic(local), lat_lon, rtol=0, atol=1e-6)
+        assert index["placement"]["misfit_m"] < 0.2
+        for wrong in ({}, {"placement": None}, {"placement": {**index["placement"], "to_local": [[1.0]]}}):
+            assert Placement.of(wrong) is None
 
     def test_a_frame_in_feet_is_converted_to_metres(self, tmp_path: Path) -> None:
         """The same points in UTM metres and in UTM feet give the same cells, clouds and poses."""
