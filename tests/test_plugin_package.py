@@ -212,7 +212,7 @@ def test_the_installed_package_is_typed_and_its_own_tests_pass(office: Office, t
     assert listed["not_loaded"] == []
     packages = {row["protocol"]: row["package"] for row in listed["devices"] if row["package"]}
     assert packages == dict.fromkeys(("example-receiver", "example-scanner"), "swath-example 1.0")
-    plain = ("-q", "-p", "no:cacheprovider", "-c", os.devnull, str(EXAMPLE / "tests"))
+    plain = ("-q", "-W", "error", "-p", "no:cacheprovider", "-c", os.devnull, str(EXAMPLE / "tests"))
     assert " passed" in office.place.run("python", "-m", "pytest", *plain, folder=tmp_path)
     command = [sys.executable, "-m", "mypy", "--strict", "--python-executable", str(office.place.bin / "python")]
     environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "MYPYPATH")}

@@ -245,6 +245,7 @@ class TestLog:
             site.install_example()
             config = parse_config(CONFIG, tmp_path / "a.toml")
             attachments = {name: data for name, _, data in config.attachments()}
+            assert list(Sources(config, attachments, ["left"]).scanner_time_parsers()) == ["scanner/left"]
             assert set(stored_drivers(attachments)[0]) == {"gnss/rover", "scanner/left"}
         missing = "is that of the package swath-example 1.0, which is not installed here; install it beside swath"
         makers, troubles = stored_drivers(attachments)

@@ -143,7 +143,7 @@ class Sources:
         return made
 
     def scanner_time_parsers(self) -> dict[str, Parser]:
-        """Return new parsers of the scanners' time messages, without returns, by source.
+        """Return new parsers of the scanners' time messages, by source; without returns, if drivers have such a parser.
 
         Raises:
             ConfigError: a driver cannot work with its settings.
@@ -151,10 +151,10 @@ class Sources:
         made: dict[str, Parser] = {}
         for name in self.scanners:
             table, source = self.config.scanner[name], f"scanner/{name}"
-            make = self._driver("scanner", name, table).make_time_parser
+            driver = self._driver("scanner", name, table)
+            make = driver.make_time_parser or driver.make_parser
             try:
-                if make is not None:
-                    made[source] = make(self.config.settings_with("scanner", name, table, self.files))
+                made[source] = make(self.config.settings_with("scanner", name, table, self.files))
             except DriverSettingsError as error:
                 raise ConfigError(f"scanner.{name}: {error}") from error
         return made

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from swath.drivers.interface import (
@@ -68,7 +69,7 @@ class ScannerParser(PacketParser):
     def __init__(self, settings: DeviceSettings) -> None:
         super().__init__()
         self._options = read_options(settings, ScannerOptions)
-        self._next: int | None = None  # sequence number
+        self._next: np.uint32 | None = None  # sequence number
 
     def parse_units(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
         """Decode datagrams of equal length, all at once."""
@@ -87,7 +88,7 @@ class ScannerParser(PacketParser):
             return []
         self.counters.messages["returns"] += len(headers)
         self.counters.bytes_framed += units.size
-        self._note_gaps(headers["sequence"])
+        self._note_gaps(headers["sequence"].astype(np.uint32))
         returns: StructArray = units[:, HEADER.itemsize :].copy().view(RETURN)
         records: list[Record] = [DeviceClockSamples(_clock_rows(host_time_ns, headers, returns))]
         return [*records, ScannerReturns(self._return_rows(host_time_ns, headers, returns))] if count else records
@@ -108,12 +109,14 @@ class ScannerParser(PacketParser):
         kept: StructArray = rows[returns["intensity"] >= self._options.least_intensity]
         return kept
 
-    def _note_gaps(self, sequence: StructArray) -> None:
-        """Count datagrams that did not arrive, by their sequence numbers."""
-        before = np.append(sequence[0] - 1 if self._next is None else self._next - 1, sequence[:-1])
-        missing = (sequence - before.astype(np.uint32) - np.uint32(1)).astype(np.int32)
-        self.counters.errors["sequence_gap"] += int(missing[missing > 0].sum())
-        self._next = int(sequence[-1]) + 1
+    def _note_gaps(self, sequence: NDArray[np.uint32]) -> None:
+        """Count datagrams that did not arrive, by their sequence numbers, which wrap."""
+        first = sequence[0] if self._next is None else self._next
+        missing = (sequence - np.append(first, sequence[:-1] + np.uint32(1))).astype(np.int32)
+        lost = int(missing[missing > 0].sum())
+        if lost:
+            self.counters.errors["sequence_gap"] += lost
+        self._next = (sequence[-1:] + np.uint32(1))[0]
 
 
 def _clock_rows(host_time_ns: Int64Array, headers: StructArray, returns: StructArray) -> StructArray:

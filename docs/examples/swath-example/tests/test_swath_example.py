@@ -68,11 +68,13 @@ def test_a_return_has_metres_and_the_time_of_its_own_pulse() -> None:
     assert row["elevation_rad"] == pytest.approx(math.radians(10.0))
 
 
-def test_datagrams_of_others_and_gaps_are_counted() -> None:
+@pytest.mark.parametrize("first", [0, 2**32 - 2])
+def test_datagrams_of_others_and_gaps_are_counted(first: int) -> None:
     parser = scanner.DRIVER.make_parser(DeviceSettings("scanner/left"))
-    sent = [scanner.encode(number, 0, -1, 0, np.zeros(2, scanner.RETURN)) for number in (2**32 - 1, 2)]
-    units = np.frombuffer(b"".join([*sent, b"x" * len(sent[0])]), np.uint8).reshape(3, -1)
-    parser.feed_batch(ChunkBatch("scanner/left", np.zeros(3, np.int64), units))
+    numbers = [first, (first + 1) % 2**32, (first + 4) % 2**32]
+    sent = [scanner.encode(number, 0, -1, 0, np.zeros(2, scanner.RETURN)) for number in numbers]
+    units = np.frombuffer(b"".join([*sent, b"x" * len(sent[0])]), np.uint8).reshape(4, -1)
+    parser.feed_batch(ChunkBatch("scanner/left", np.zeros(4, np.int64), units))
     parser.feed(Chunk("scanner/left", 0, b"?"))
     assert dict(parser.counters.errors) == {"bad_magic": 1, "bad_length": 1, "sequence_gap": 2}
     counters = parser.counters
