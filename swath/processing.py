@@ -538,6 +538,9 @@ def calibrate(
     free: Sequence[str] = (),
     observe: Sequence[str] = ("planes",),
     scanners: Sequence[str] = (),
+    datum: str | None = None,
+    epoch: float | None = None,
+    force_crs: bool = False,
     workers: int = 1,
     tell: Tell = silent,
 ) -> CalibrationResult:
@@ -553,6 +556,7 @@ def calibrate(
         fix, free: parameters to hold or to estimate beside those of the model.
         observe: planes or ties, and markings.
         scanners: names of those to use; empty: all.
+        datum, epoch, force_crs: as in `georeference`.
         workers: processes and threads that search; above 1, call it under ``if __name__ == "__main__":``.
         tell: called with the progress.
 
@@ -568,7 +572,13 @@ def calibrate(
                     output=folder / "calibration.toml",
                     trajectory=_trajectory_options(track, navigate=True),
                     options=Options(
-                        crs=crs, scanners=tuple(scanners), calibrations=_calibrations(start), uncertainty=False
+                        crs=crs,
+                        force_crs=force_crs,
+                        datum=datum,
+                        epoch=epoch,
+                        scanners=tuple(scanners),
+                        calibrations=_calibrations(start),
+                        uncertainty=False,
                     ),
                     config=log.config,
                     workers=workers,
