@@ -201,6 +201,9 @@ class ImuConfig(Section):
     solution_of: Literal["vehicle", "sensor1", "sensor2"] = Field(
         "vehicle", description="applanix-pos: the point whose navigation is the solution"
     )
+    acceleration_unit: Literal["m/s2", "g"] = Field(
+        "m/s2", description="records: unit of its accelerations; some drivers of ROS (Livox) send g"
+    )
     rate_hz: float = Field(200.0, gt=0.0, le=100_000.0, description="nominal sample rate")
     rotation_b_imu: Matrix = Field(
         default_factory=_identity,

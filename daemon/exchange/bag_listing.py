@@ -16,10 +16,12 @@ import numpy as np
 from swath.daemon.devices.identify import Recognised, recognise
 from swath.daemon.errors import one_line
 from swath.daemon.exchange.bags import WIRES, WORDS
+from swath.daemon.exchange.record_facts import RecordFacts, facts_of
+from swath.daemon.exchange.tables import RECORDS
 from swath.drivers.captures.base import CapturedUnit, CaptureTally, until_damage
 from swath.drivers.captures.opening import open_bag
 from swath.drivers.captures.rosbag.messages import SECOND, BagTopic, Carries
-from swath.drivers.driver import RAW, all_drivers
+from swath.drivers.driver import KINDS, RAW, all_drivers
 from swath.drivers.parser import DeviceKind
 from swath.georef.records import ChunkBatch
 from swath.georef.timescales import SECOND_NS
@@ -33,6 +35,7 @@ _KINDS: dict[Carries, tuple[DeviceKind, ...]] = {
     "bytes": ("gnss", "imu", "corrections", "scanner"),
     "can": ("imu",),
 }
+_DEVICES = {"gnss": "a receiver", "imu": "an inertial unit", "scanner": "a scanner", "raw": "a device"}
 _PORTS = {"velodyne": (2368, 8308), "hesai": (2368, 10110), "robosense": (6699, 7788), "ouster": (7502, 7503)}
 _OTHER_PORTS = (9000, 9500)
 _NEEDED = {  # lines for the keys that a driver requires
@@ -42,6 +45,7 @@ _NEEDED = {  # lines for the keys that a driver requires
     "tick_hz": "tick_hz = 1000000.0  # change: rate of its counter",
 }
 _MAX_NAME = 40
+_IMU, _ODOMETRY = "sensor_msgs/msg/Imu", "nav_msgs/msg/Odometry"
 _APART_NS = 10 * SECOND_NS  # a clock that is set well, and a recorder that is not late, differ by less
 
 
@@ -58,6 +62,7 @@ class ListedTopic:
         others: protocols whose heads send the same; only the user knows which it is.
         source: of the proposed configuration; "" if it has none for this topic.
         damage: what is wrong with its first messages; "" if nothing is.
+        facts: of decoded values; None for others.
     """
 
     topic: BagTopic
@@ -69,6 +74,7 @@ class ListedTopic:
     others: list[str] = field(default_factory=list)
     source: str = ""
     damage: str = ""
+    facts: RecordFacts | None = None
 
     def words(self) -> str:
         """Say in a few words what becomes of the topic."""
@@ -79,15 +85,22 @@ class ListedTopic:
             return f"{what}; {self.damage}"
         if not self.read:
             return f"{what}; none in this bag"
+        if self.facts is not None:
+            apart = _apart_words(self.offset_ns or 0)
+            return f"{what} of {_DEVICES[self.kind or 'raw']}{apart}{self.facts.text}"
         meant = " or ".join([self.protocol, *self.others])
         device = f"of {self.kind} {meant}" if self.protocol else "of a device that is not recognised"
         if self.offset_ns is None:
             return f"{what} {device}, with the times of the bag"
-        apart = ""
-        if abs(self.offset_ns) > _APART_NS:
-            where = "after" if self.offset_ns > 0 else "before"
-            apart = f", {abs(self.offset_ns) / SECOND_NS:,.0f} s {where} those of the bag"
-        return f"{what} {device}, with their own times{apart}"
+        return f"{what} {device}, with their own times{_apart_words(self.offset_ns)}"
+
+
+def _apart_words(offset_ns: int) -> str:
+    """Return words on how far units' own times are from the bag's; empty if they are near."""
+    if abs(offset_ns) <= _APART_NS:
+        return ""
+    where = "after" if offset_ns > 0 else "before"
+    return f", {abs(offset_ns) / SECOND_NS:,.0f} s {where} those of the bag"
 
 
 @dataclass(slots=True)
@@ -181,12 +194,17 @@ def _listed(bag: Bag, topic: BagTopic) -> ListedTopic:
     if topic.raw is None or not topic.count:
         return listed
     tally = CaptureTally()
-    batches = _first_units(until_damage(bag.units([topic.name], tally), tally), topic.name)
+    taken = _first_units(until_damage(bag.units([topic.name], tally), tally), topic.name)
+    batches = [_batch(length, list(run)) for length, run in itertools.groupby(taken, key=lambda unit: len(unit.data))]
     listed.read = bool(batches)
     if not batches:
         listed.damage = tally.first_damage
         return listed
     listed.offset_ns = bag.offsets_ns.get(topic.name)
+    if topic.raw.carries == "records":
+        listed.kind = next(kind for kind in KINDS if kind == topic.raw.device)
+        listed.protocol, listed.facts = RECORDS, facts_of(taken)
+        return listed
     found: list[tuple[Recognised, DeviceKind]] = []
     for kind in _KINDS[topic.raw.carries]:
         one = recognise(kind, _transport(topic.raw.carries, "probe", 0), batches)
@@ -199,8 +217,8 @@ def _listed(bag: Bag, topic: BagTopic) -> ListedTopic:
     return listed
 
 
-def _first_units(units: Iterator[CapturedUnit], name: str) -> list[ChunkBatch]:
-    """Return the first units of a topic, in batches of one length."""
+def _first_units(units: Iterator[CapturedUnit], name: str) -> list[CapturedUnit]:
+    """Return the first units of a topic."""
     taken: list[CapturedUnit] = []
     size = 0
     for unit in itertools.islice(units, _TRIED_UNITS):
@@ -209,7 +227,7 @@ def _first_units(units: Iterator[CapturedUnit], name: str) -> list[ChunkBatch]:
             size += len(unit.data)
         if size > _TRIED_BYTES:
             break
-    return [_batch(length, list(run)) for length, run in itertools.groupby(taken, key=lambda unit: len(unit.data))]
+    return taken
 
 
 def _batch(length: int, run: list[CapturedUnit]) -> ChunkBatch:
@@ -229,9 +247,10 @@ class _Proposal:
     def sections(self) -> list[str]:
         """Return the text of each section."""
         sections: list[str] = []
+        self._join_odometry()
         second = [one for one in self._topics if one.topic.second]
         for one in self._topics:
-            if one.topic.second:
+            if one.topic.second or one.source or not self._is_proposed(one):
                 continue
             mate = next((other for other in second if _same_head(one, other)), None)
             if mate is not None:
@@ -239,12 +258,26 @@ class _Proposal:
             sections += self._section(one, mate)
         return sections
 
+    def _is_proposed(self, one: ListedTopic) -> bool:
+        """Return whether a topic gets a section: decoded points do where the bag has no packets of a scanner."""
+        if one.facts is None or one.kind != "scanner":
+            return one.facts is None or one.facts.usable
+        return not any(other.kind == "scanner" and other.facts is None for other in self._topics)
+
+    def _join_odometry(self) -> None:
+        """Give attitudes to the first inertial unit of the same bag, which has the name of its topic."""
+        samples = [one for one in self._topics if one.topic.kind == _IMU and self._is_proposed(one)]
+        for one in self._topics:
+            if samples and one.topic.kind == _ODOMETRY:
+                one.source = f"imu/{_name(samples[0].topic.name)}"
+
     def _section(self, one: ListedTopic, mate: ListedTopic | None) -> Iterator[str]:
         """Yield the section of a topic's device, and that of a device inside its stream."""
         assert one.topic.raw is not None
         name = self._name_of(one.topic.name)
         kind = one.kind or "raw"
-        carries: Carries = "datagrams" if kind == "scanner" else one.topic.raw.carries
+        as_datagrams = kind == "scanner" or one.facts is not None
+        carries: Carries = "datagrams" if as_datagrams else one.topic.raw.carries
         first, second = _PORTS.get(one.protocol.partition("-")[0], _OTHER_PORTS)
         lines = [f"[{kind}.{name}]", f'transport = "{_transport(carries, name, self._port(carries, first))}"']
         if mate is not None and kind == "scanner":
@@ -256,7 +289,10 @@ class _Proposal:
         if one.kind:
             driver = all_drivers(one.kind)[one.protocol]
             lines += [_NEEDED.get(key, f"# {key} = …").format(name=name) for key in driver.needs]
+        lines += one.facts.lines if one.facts is not None else []
         yield "\n".join(lines) + "\n"
+        if one.facts is not None:
+            return
         for inside in ("gnss", "imu"):
             other = all_drivers(inside).get(one.protocol) if inside != one.kind else None
             if other is not None and one.kind in other.transports:
@@ -283,6 +319,7 @@ def _transport(carries: Carries, name: str, port: int) -> str:
         "datagrams": f"udp:0.0.0.0:{port}",
         "bytes": f"serial:/dev/{name}?baud=115200",
         "can": f"can:socketcan:{name}?bitrate=500000",
+        "records": f"udp:0.0.0.0:{port}",
     }
     return wires[carries]
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from swath.daemon.errors import UserError
 from swath.daemon.exchange.captures import Capture
 from swath.daemon.exchange.routes import Port, Routes
+from swath.daemon.exchange.tables import RECORDS
 from swath.drivers.captures.opening import open_bag
 from swath.drivers.captures.rosbag.messages import SECOND, BagTopic, Carries
 
@@ -15,12 +16,22 @@ WIRES: dict[Carries, tuple[str, ...]] = {  # kinds of transport whose units a to
     "datagrams": ("udp",),
     "bytes": ("serial", "tcp", "udp", "ntrip"),
     "can": ("can",),
+    "records": ("udp", "tcp", "serial"),
 }
-WORDS: dict[Carries, str] = {"datagrams": "datagrams", "bytes": "pieces of a byte stream", "can": "CAN frames"}
+WORDS: dict[Carries, str] = {
+    "datagrams": "datagrams",
+    "bytes": "pieces of a byte stream",
+    "can": "CAN frames",
+    "records": "decoded values",
+}
 
 
 def _fits(topic: BagTopic, port: Port) -> bool:
-    return topic.raw is not None and port.kind in WIRES[topic.raw.carries]
+    if topic.raw is None or port.kind not in WIRES[topic.raw.carries]:
+        return False
+    if topic.raw.carries != "records":
+        return port.protocol != RECORDS
+    return port.protocol == RECORDS and port.source.startswith(f"{topic.raw.device}/") and not port.is_aux
 
 
 def _expects(port: Port, topic: BagTopic) -> bool:
@@ -89,6 +100,10 @@ class BagChoice:
             raise UserError(f"{path}: {name} ({topic.kind}) cannot be imported: {topic.why}")
         if not _fits(topic, port):
             held = WORDS[topic.raw.carries]
+            if topic.raw.carries == "records" or port.protocol == RECORDS:
+                wanted = f'[{topic.raw.device or port.source.partition("/")[0]}.…] of protocol "{RECORDS}"'
+                also = "" if topic.raw.carries == "records" else "; only decoded values belong to it"
+                raise UserError(f"{path}: {name} holds {held}, want a source {wanted}{also}")
             raise UserError(f"{path}: {name} holds {held}, but {port.source} uses {port.kind} in this configuration")
         return topic
 

@@ -51,6 +51,7 @@ _UPPER = np.triu_indices(3)
 _FIX_TYPES = {int(one): one for one in FixType}
 _LEAPS_KNOWN_NS = gps_ns_from_utc(LEAP_TABLE_VALID_UNTIL, 0, 18)
 UNKNOWN_SIGMA_S = 1.0
+STANDARD_GRAVITY = 9.80665  # m/s², CGPM 1901
 INERTIAL_RECORDS = (ImuSamples, InsSolution)
 
 
@@ -61,13 +62,14 @@ class RecordsParser(FramedParser):
     ``no_time``, fixes and marks without a time that is known, which are left out.
 
     Args:
-        settings: no key is needed.
+        settings: ``acceleration_unit``, if the values are not in the frame's m/s².
         wanted: the record types to return.
     """
 
     def __init__(self, settings: DeviceSettings, wanted: tuple[type, ...]) -> None:
         super().__init__((RECORDS,), wanted)
         self._source = settings.source
+        self._unit = STANDARD_GRAVITY if settings.config.get("acceleration_unit") == "g" else 1.0
         self._inertial = any(kind in wanted for kind in INERTIAL_RECORDS)
         self._receiver = any(kind in wanted for kind in RECEIVER_RECORDS)
         self._told_second = NO_TIME_NS  # that a fix named last
@@ -96,7 +98,9 @@ class RecordsParser(FramedParser):
         gps_ns = gps_times(rows["time_ns"], scale)
         self._after_table |= scale is Scale.UTC and bool((gps_ns > _LEAPS_KNOWN_NS).any())
         if self._inertial and len(rows) and kind is RowKind.SAMPLE:
-            yield _samples(rows, host_ns, gps_ns, scale)
+            samples = _samples(rows, host_ns, gps_ns, scale)
+            samples.rows["specific_force_b"] *= self._unit
+            yield samples
         elif self._inertial and len(rows) and kind is RowKind.SOLUTION:
             yield _solutions(rows, host_ns, gps_ns)
         elif self._receiver and kind in _READERS:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 
+import numpy as np
 import pyarrow
 import pyarrow.parquet
 
@@ -30,7 +31,17 @@ from swath.drivers.captures.opening import (
 from swath.drivers.captures.rosbag.messages import SENTENCE
 from swath.drivers.captures.tables.read import read_table
 from swath.drivers.transports.base import TransportError
-from tests.drivers.captures.bags import CONTAINERS, Ros, every_type, write_bag
+from tests.drivers.captures.bags import (
+    CONTAINERS,
+    START_NS,
+    Ros,
+    cloud_message,
+    custom_message,
+    every_type,
+    fix_message,
+    imu_message,
+    write_bag,
+)
 from tests.drivers.captures.network import SYN, a_ms_apart, acknowledging, from_device, pcap_of
 from tests.drivers.livox_cases import FILES
 from tests.drivers.lvx_files import FileHead, lvx1_package, lvx2_package, lvx_file
@@ -165,7 +176,16 @@ def _bags() -> Target:
     seeds = []
     with tempfile.TemporaryDirectory(prefix="swath-fuzz-") as folder:
         for container in CONTAINERS:
-            messages = [one for one in every_type(Ros(container))[0] if one[1] in _FUZZED_TYPES]
+            ros = Ros(container)
+            messages = [one for one in every_type(ros)[0] if one[1] in _FUZZED_TYPES]
+            points = np.array([(1.0, 2.0, 3.0, 0.01)] * 4, [(name, "<f4") for name in ("x", "y", "z", "time")])
+            for kind, message in (
+                ("sensor_msgs/msg/Imu", imu_message(ros, START_NS, (0.1, 0.2, 9.8), (0.1, 0.2, 0.3))),
+                ("sensor_msgs/msg/NavSatFix", fix_message(ros, START_NS, (47.0, 8.0, 500.0))),
+                ("sensor_msgs/msg/PointCloud2", cloud_message(ros, START_NS, points)),
+                ("livox_ros_driver2/msg/CustomMsg", custom_message(ros, START_NS, [(0, 1.0, 2.0, 3.0, 4, 5, 6)] * 3)),
+            ):
+                messages.append((f"/{kind}", kind, START_NS, message))
             seeds.append(write_bag(Path(folder, container), container, messages).read_bytes())
     target = _captures("bag", seeds, _read_bag)
     return dataclasses.replace(target, peak_bytes=lambda size: (64 << 20) + 400 * size)  # rosbags compiles definitions

@@ -6,8 +6,9 @@ names; a single file needs none.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -20,13 +21,14 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from swath.drivers.captures.base import CaptureDamageError, CapturedUnit, CaptureTally, report
+from swath.drivers.captures.rosbag.decoded import Records
 from swath.drivers.captures.rosbag.kinds import HEAD_BYTES, MCAP, ROS1, SQLITE, BoundedPath, bag_kind
 from swath.drivers.captures.rosbag.messages import (
     DECODED_TYPES,
-    RAW_TYPES,
     SECOND,
     SENTENCE,
     SPLIT_TYPE,
+    TOPIC_TYPES,
     BagTopic,
     RawType,
 )
@@ -104,7 +106,7 @@ class Bag:
             counts[key] = counts.get(key, 0) + connection.msgcount
             formats[key] = getattr(connection.ext, "serialization_format", "cdr")
         for (name, kind), count in counts.items():
-            raw = RAW_TYPES.get(kind)
+            raw = TOPIC_TYPES.get(kind)
             if raw is not None and formats[name, kind] == "cdr":
                 yield BagTopic(name, kind, count, raw)
                 if kind == SPLIT_TYPE:
@@ -161,6 +163,7 @@ class Bag:
             except ValueError as error:
                 report(tally, f"{self.path}: a message of {topic} is not {connection.msgtype}: {error}")
                 continue
+            arrived = TOPIC_TYPES[connection.msgtype].carries == "records"  # which hold their own times
             for stamp_ns, content, second in units:
                 if content is None:
                     report(tally, f"{self.path}: a message of {topic} has a packet longer than its place")
@@ -168,11 +171,11 @@ class Bag:
                 channel = topic + SECOND if second else topic
                 if stamp_ns and channel not in self.offsets_ns:
                     self.offsets_ns[channel] = stamp_ns - time_ns
-                yield CapturedUnit(stamp_ns or time_ns, content, channel)
+                yield CapturedUnit(time_ns if arrived else stamp_ns or time_ns, content, channel)
 
     def _of(self, names: Sequence[str]) -> list[Connection]:
         wanted = {name.removesuffix(SECOND) for name in names}
-        return [one for one in self._connections if one.topic in wanted and one.msgtype in RAW_TYPES]
+        return [one for one in self._connections if one.topic in wanted and one.msgtype in TOPIC_TYPES]
 
     def _messages(self, connections: list[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
         if not connections:  # which would mean all of them to the library
@@ -183,7 +186,7 @@ class Bag:
             raise CaptureDamageError(f"{self.path}: cannot be read further: {_words(error)}") from error
 
     def _unwrapper(self, connection: Connection) -> Unwrapper:
-        raw = RAW_TYPES[connection.msgtype]
+        raw = TOPIC_TYPES[connection.msgtype]
         return Unwrapper(list(_forms(connection, raw, self.kind == "ROS 2")))
 
 
@@ -198,26 +201,32 @@ def _forms(connection: Connection, raw: RawType, ros2: bool) -> Iterator[Form]:
     own = definition.format != MessageDefinitionFormat.NONE and raw.name != SENTENCE
     if own:
         texts.insert(0, definition.data)
+    if not texts:  # of ROS's own packages, which the library knows
+        texts.append("")
     for number, text in enumerate(texts):
         idl = own and number == 0 and definition.format == MessageDefinitionFormat.IDL
         with suppress(Exception):  # a damaged definition makes the library raise anything; it is then no way
-            types = get_types_from_idl(text) if idl else get_types_from_msg(text, connection.msgtype)
+            parsed = get_types_from_idl if idl else partial(get_types_from_msg, name=connection.msgtype)
+            types = parsed(text) if text else {}
             store = get_typestore(Stores.ROS2_HUMBLE if ros2 else Stores.ROS1_NOETIC)
             store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
-            yield _packets(raw, store, ros2) or _decoded(raw, store, ros2)
+            if raw.carries == "records":
+                yield Records(raw, _decoder(raw, store, ros2), ros2=ros2)
+            else:
+                yield _packets(raw, store, ros2) or Decoded(raw, _decoder(raw, store, ros2))
 
 
-def _decoded(raw: RawType, store: Typestore, ros2: bool) -> Decoded:
-    """Return the reader that decodes messages by the library."""
+def _decoder(raw: RawType, store: Typestore, ros2: bool) -> Callable[[bytes], Any]:
+    """Return a function that decodes messages by the library."""
     decode = store.deserialize_cdr if ros2 else store.deserialize_ros1
 
-    def decoded(data: bytes) -> object:
+    def decoded(data: bytes) -> Any:
         try:
             return decode(data, raw.name)
         except Exception as error:  # damaged data, or a damaged definition, make the library raise anything
             raise ValueError(_words(error)) from error
 
-    return Decoded(raw, decoded)
+    return decoded
 
 
 def _packets(raw: RawType, store: Typestore, ros2: bool) -> Packets | None:

@@ -1,4 +1,4 @@
-"""Knows the ROS messages that carry devices' bytes, and takes the bytes out of them.
+"""Knows the ROS messages that carry devices' bytes, or values that another program decoded from them.
 
 A ROS 1 bag and most MCAP files hold the definitions of their messages; those count. A bag of SQLite holds none before
 version 4 of its schema; the definitions here serve then. They are the fields of these packages:
@@ -23,7 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-Carries = Literal["datagrams", "bytes", "can"]
+Carries = Literal["datagrams", "bytes", "can", "records"]
 
 SENTENCE = "nmea_msgs/msg/Sentence"  # its text is read as bytes, because a receiver may send any
 SECOND = "#2"  # behind a topic's name: its units of the head's second port; no topic has this sign in its name
@@ -35,12 +35,13 @@ class RawType:
 
     Attributes:
         name: as ROS 2 writes it, ``package/msg/Type``.
-        carries: datagrams, pieces of a byte stream, or CAN frames.
+        carries: datagrams, pieces of a byte stream, CAN frames, or values that another program decoded.
         definitions: what the message may consist of where the bag does not say it: text in the form of ROS, whose
             other types follow after lines ``MSG: package/Type``, as in a ROS 1 bag.
         protocols: beginnings of the protocols that it may carry; empty: any.
         second: the messages hold packets of a head's second port.
         named: only a topic that the user names is read, because such messages may hold anything.
+        device: of decoded values, the kind of device that they are of.
     """
 
     name: str
@@ -49,6 +50,7 @@ class RawType:
     protocols: tuple[str, ...] = ()
     second: bool = False
     named: bool = False
+    device: str = ""
 
 
 _RULE = "=" * 80 + "\n"
@@ -144,17 +146,44 @@ _ALL = (
 RAW_TYPES = {raw.name: raw for raw in _ALL}
 SPLIT_TYPE = "rslidar_msg/msg/RslidarPacket"  # its messages say which of the two ports a packet came from
 
-DECODED_TYPES = {  # messages whose values another program decoded from a device's bytes, which they no longer hold
-    "sensor_msgs/msg/Imu": "inertial samples",
-    "sensor_msgs/msg/NavSatFix": "positions",
-    "sensor_msgs/msg/TimeReference": "times of a receiver",
-    "sensor_msgs/msg/PointCloud2": "points",
-    "gps_common/msg/GPSFix": "positions and velocities",
-    "gps_msgs/msg/GPSFix": "positions and velocities",
-    "nav_msgs/msg/Odometry": "positions and attitudes",
-    "livox_ros_driver/msg/CustomMsg": "points",
-    "livox_ros_driver2/msg/CustomMsg": "points",
+CUSTOM_MSG = ("livox_ros_driver/msg/CustomMsg", "livox_ros_driver2/msg/CustomMsg")
+_LIVOX = (
+    f"{_HEADER}uint64 timebase\nuint32 point_num\nuint8 lidar_id\nuint8[3] rsvd\n{{package}}/CustomPoint[] points\n"
+    f"{_RULE}MSG: {{package}}/CustomPoint\nuint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\nuint8 reflectivity\n"
+    "uint8 tag\nuint8 line\n"
+)
+_GPS_FIX = (
+    f"{_HEADER}{{package}}/GPSStatus status\nfloat64 latitude\nfloat64 longitude\nfloat64 altitude\nfloat64 track\n"
+    "float64 speed\nfloat64 climb\nfloat64 pitch\nfloat64 roll\nfloat64 dip\nfloat64 time\nfloat64 gdop\nfloat64 pdop\n"
+    "float64 hdop\nfloat64 vdop\nfloat64 tdop\nfloat64 err\nfloat64 err_horz\nfloat64 err_vert\nfloat64 err_track\n"
+    "float64 err_speed\nfloat64 err_climb\nfloat64 err_time\nfloat64 err_pitch\nfloat64 err_roll\nfloat64 err_dip\n"
+    f"float64[9] position_covariance\nuint8 position_covariance_type\n{_RULE}MSG: {{package}}/GPSStatus\n{_HEADER}"
+    "uint16 satellites_used\nint32[] satellite_used_prn\nuint16 satellites_visible\nint32[] satellite_visible_prn\n"
+    "int32[] satellite_visible_z\nint32[] satellite_visible_azimuth\nint32[] satellite_visible_snr\nint16 status\n"
+    "uint16 motion_source\nuint16 orientation_source\nuint16 position_source\n"
+)
+
+
+def _values(name: str, device: str, definition: str = "") -> RawType:
+    texts = (definition.format(package=name.partition("/")[0]),) if definition else ()
+    return RawType(name, "records", texts, ("records",), device=device)
+
+
+# messages whose values another program decoded from a device's bytes, which they no longer hold
+RECORD_TYPES = {
+    one.name: one
+    for one in (
+        _values("sensor_msgs/msg/Imu", "imu"),
+        _values("sensor_msgs/msg/NavSatFix", "gnss"),
+        _values("sensor_msgs/msg/PointCloud2", "scanner"),
+        _values("gps_common/msg/GPSFix", "gnss", _GPS_FIX),
+        _values("gps_msgs/msg/GPSFix", "gnss", _GPS_FIX),
+        _values("nav_msgs/msg/Odometry", "imu"),
+        *(_values(name, "scanner", _LIVOX) for name in CUSTOM_MSG),
+    )
 }
+TOPIC_TYPES = RAW_TYPES | RECORD_TYPES
+DECODED_TYPES = {"sensor_msgs/msg/TimeReference": "times of a receiver"}  # that are not imported
 
 
 @dataclass(frozen=True, slots=True)

@@ -174,7 +174,7 @@ class _Utf8(io.RawIOBase):
         self._rest = b""
 
     def readable(self) -> bool:
-        """Return True."""
+        """Return True, as the stream can be read."""
         return True
 
     def readinto(self, buffer: Any) -> int:

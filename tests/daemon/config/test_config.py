@@ -93,6 +93,7 @@ class TestWholeFile:
             "imu.*.byte_order",
             "imu.*.pps_event",
             "imu.*.altitude",
+            "imu.*.acceleration_unit",
             "imu.*.solution_of",
             "scanner.*.geometry.facets",
             "scanner.*.geometry.nutation_deg",

@@ -7,6 +7,7 @@ import itertools
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from benchmarks.import_bag import make_bag
@@ -18,7 +19,18 @@ from swath.drivers.captures.opening import read_candump, read_pcap
 from tests.builders import ROOT
 from tests.daemon.commands import swath
 from tests.daemon.exchange.builders import content_of, run_import, write_config
-from tests.drivers.captures.bags import CONTAINERS, START_NS, Container, Message, Ros, every_type, payloads, write_bag
+from tests.drivers.captures.bags import (
+    CONTAINERS,
+    START_NS,
+    Container,
+    Message,
+    Ros,
+    cloud_message,
+    every_type,
+    imu_message,
+    payloads,
+    write_bag,
+)
 
 FIXTURES = ROOT / "fixtures"
 SCAN, PACKET = "velodyne_msgs/msg/VelodyneScan", "velodyne_msgs/msg/VelodynePacket"
@@ -149,15 +161,41 @@ def test_decoded_messages_are_listed_as_such(tmp_path: Path) -> None:
     text = swath("import", "--list", str(bag)).stdout
     assert f"# {bag}: ROS 1 bag, 58 messages of 7 topics" in text
     when = "from 2021-06-30 23:16:22.967 UTC to 2021-06-30 23:16:22.984 UTC"
-    assert (
-        f"#   /gps/fix (sensor_msgs/msg/NavSatFix): 12 messages {when}\n#       positions, decoded; not imported yet\n"
-        in text
-    )
-    assert "[session]" not in text
+    words = "decoded values of a receiver; without velocities"
+    assert f"#   /gps/fix (sensor_msgs/msg/NavSatFix): 12 messages {when}\n#       {words}\n" in text
+    assert "attitude and velocity only, as its frame of positions is not known" in text
     write_config(tmp_path)
     result = swath("import", str(tmp_path / "swath.toml"), str(bag), "-o", str(tmp_path / "logs"))
-    want = f"swath: {bag}: holds no messages with the bytes of a device; `swath import --list {bag}` lists its topics"
+    want = f"swath: {bag}: holds topic /gps/gps (12), topic /gps/fix (12), topic /novatel/oem7/odom (12); "
+    want += f"`swath import --list {bag}` proposes a configuration"
     assert (result.returncode, result.stderr) == (1, f"{want}\n")
+    (tmp_path / "proposed.toml").write_text(text)
+    named = [line.strip(" #\\").removeprefix("--source ") for line in text.splitlines() if "--source" in line]
+    report, _ = run_import(load_config(tmp_path / "proposed.toml"), [], tmp_path / "logs", ImportOptions(named))
+    assert report.units == {"gnss/gps_fix": 12, "gnss/gps_gps": 12, "imu/novatel_oem7_odom": 12}
+
+
+def test_values_that_cannot_be_used_are_listed_as_such(tmp_path: Path) -> None:
+    """NovAtel's CORRIMU has no gravity; Livox drivers send g; points without times are refused."""
+    bag = tmp_path / "ins1.bag"
+    bag.write_bytes(gzip.decompress((FIXTURES / "novatel" / "ins1.bag.gz").read_bytes()))
+    text = swath("import", "--list", str(bag)).stdout
+    assert "accelerations of 0.00 m/s² on average, so gravity was removed from them: no trajectory can be" in text
+    assert "[session]" not in text
+    ros = Ros("mcap")
+    messages: list[Message] = []
+    for number in range(50):
+        at_ns = START_NS + number * 5_000_000
+        messages.append(("/livox/imu", IMU, at_ns, imu_message(ros, at_ns, (0.01, 0.0, 1.0), (0.0, 0.0, 0.1))))
+    bare = np.zeros(3, [(axis, "<f4") for axis in "xyz"])
+    messages.append(("/points", "sensor_msgs/msg/PointCloud2", START_NS, cloud_message(ros, START_NS, bare)))
+    text = swath("import", "--list", str(write_bag(tmp_path / "a", "mcap", messages))).stdout
+    assert "about 200 a second; accelerations of 1.00, so they are in g, though the message is to have m/s²" in text
+    assert "gravity shows that z points up" in text
+    assert 'acceleration_unit = "g"' in text
+    assert "rotation_b_imu = [[1, 0, 0], [0, -1, 0], [0, 0, -1]]  # change" in text
+    assert "has no time of each point (fields x, y, z)" in text
+    assert "[scanner" not in text
 
 
 @pytest.mark.slow

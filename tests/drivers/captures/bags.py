@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,7 +12,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Ros2Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from swath.drivers.captures.rosbag.messages import RAW_TYPES
+from swath.drivers.captures.rosbag.messages import RAW_TYPES, TOPIC_TYPES
 
 Container = Literal["db3", "mcap", "bag"]
 CONTAINERS: tuple[Container, ...] = ("db3", "mcap", "bag")
@@ -26,7 +27,9 @@ class Ros:
     def __init__(self, container: Container, form: int = 0) -> None:
         self.container = container
         self.store = get_typestore(Stores.ROS1_NOETIC if container == "bag" else Stores.ROS2_HUMBLE)
-        for name, raw in RAW_TYPES.items():
+        for name, raw in TOPIC_TYPES.items():
+            if not raw.definitions:  # one of ROS's own, which the library knows
+                continue
             text = raw.definitions[min(form, len(raw.definitions) - 1)]
             if name == "nmea_msgs/msg/Sentence":
                 text = "std_msgs/Header header\nstring sentence\n"
@@ -162,3 +165,89 @@ def every_type(ros: Ros) -> tuple[list[Message], Units]:
     )
     add(kind, message, [(START_NS, b"\x1f\0\0\0\x0c\4\0\0" + bytes(64))])
     return messages, units
+
+
+# --- decoded values -------------------------------------------------------------------------------------------------
+
+
+def vector(ros: Ros, x: float, y: float, z: float) -> Any:
+    """Return a vector."""
+    return ros.make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+
+def imu_message(ros: Ros, stamp_ns: int, force: Sequence[float], rate: Sequence[float], mark: float = 0.0) -> Any:
+    """Return a sample; ``mark`` is the first number of its covariances, -1 for none."""
+    covariance = np.array([mark, *[0.0] * 8])
+    return ros.make(
+        "sensor_msgs/msg/Imu",
+        header=ros.header(stamp_ns),
+        orientation=ros.make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation_covariance=covariance,
+        angular_velocity=vector(ros, *rate),
+        angular_velocity_covariance=covariance,
+        linear_acceleration=vector(ros, *force),
+        linear_acceleration_covariance=covariance,
+    )
+
+
+def fix_message(ros: Ros, stamp_ns: int, place: Sequence[float], status: int = 0, **fields: Any) -> Any:
+    """Return a position in degrees and m, with a covariance where ``fields`` give one."""
+    latitude, longitude, altitude = place
+    given = {"position_covariance": np.zeros(9), "position_covariance_type": 0} | fields
+    return ros.make(
+        "sensor_msgs/msg/NavSatFix",
+        header=ros.header(stamp_ns),
+        status=ros.make("sensor_msgs/msg/NavSatStatus", status=status, service=1),
+        latitude=latitude,
+        longitude=longitude,
+        altitude=altitude,
+        **given,
+    )
+
+
+def cloud_message(ros: Ros, stamp_ns: int, points: Any, **fields: Any) -> Any:
+    """Return a cloud of points, a structured array (n,) or (rows, n), by the fields and offsets of its dtype."""
+    codes = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+    dtype = points.dtype
+    table = np.atleast_2d(points)
+    given = {
+        "height": table.shape[0],
+        "width": table.shape[1],
+        "is_bigendian": any(dtype[name].byteorder == ">" for name in dtype.names),
+        "point_step": dtype.itemsize,
+        "row_step": dtype.itemsize * table.shape[1],
+        "data": np.frombuffer(table.tobytes(), np.uint8),
+        "is_dense": False,
+    }
+    return ros.make(
+        "sensor_msgs/msg/PointCloud2",
+        header=ros.header(stamp_ns),
+        fields=[
+            ros.make(
+                "sensor_msgs/msg/PointField",
+                name=name,
+                offset=dtype.fields[name][1],
+                datatype=codes[dtype[name].str[1:]],
+                count=1,
+            )
+            for name in dtype.names
+        ],
+        **given | fields,
+    )
+
+
+def custom_message(
+    ros: Ros, stamp_ns: int, points: Sequence[Sequence[float]], package: str = "livox_ros_driver2"
+) -> Any:
+    """Return Livox points: offset in ns, x, y, z, reflectivity, tag, line."""
+    names = ("offset_time", "x", "y", "z", "reflectivity", "tag", "line")
+    made = [ros.make(f"{package}/msg/CustomPoint", **dict(zip(names, one, strict=True))) for one in points]
+    return ros.make(
+        f"{package}/msg/CustomMsg",
+        header=ros.header(stamp_ns),
+        timebase=stamp_ns,
+        point_num=len(points),
+        lidar_id=0,
+        rsvd=np.zeros(3, np.uint8),
+        points=made,
+    )
