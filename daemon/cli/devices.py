@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 def describe_driver(driver: Driver) -> dict[str, Any]:
     """Return a driver as plain values, the form of ``--json``."""
+    fields = {} if driver.options is None else driver.options.model_fields
     return {
         "protocol": driver.protocol,
         "kind": driver.kind,
@@ -22,6 +23,7 @@ def describe_driver(driver: Driver) -> dict[str, Any]:
         "gives_time": driver.kind == "gnss",  # only receivers name the seconds of the clock
         "names_edge": str(driver.names_edge) if driver.names_edge is not None else None,
         "needs": list(driver.needs),
+        "options": {key: field.description for key, field in fields.items()},
         "summary": driver.summary,
         "package": None if driver.package is None else str(driver.package),
     }
@@ -65,6 +67,8 @@ def _print_table(listed: list[dict[str, Any]]) -> None:
         what.append("\nyields " + (", ".join(row["yields"]) or "no records"), style="dim")
         if row["needs"]:
             what.append("\nneeds " + ", ".join(row["needs"]), style="yellow")
+        if row["options"]:
+            what.append("\noptions " + ", ".join(row["options"]), style="dim")
         if row["package"]:
             what.append(f"\nfrom the package {row['package']}", style="dim")
         table.add_row(first, row["protocol"], ", ".join(row["transports"]), what)

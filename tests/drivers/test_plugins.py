@@ -9,6 +9,7 @@ import enum
 import inspect
 import json
 import re
+import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -100,9 +101,19 @@ class TestFinding:
         told = json.loads(capsys.readouterr().out)
         packages = {row["protocol"]: row["package"] for row in told["devices"] if row["package"]}
         assert packages == dict.fromkeys(ENTRIES, "swath-example 1.0")
+        [options] = [row["options"] for row in told["devices"] if row["protocol"] == "example-receiver"]
+        assert list(options) == ["heights"]
+        assert options["heights"].startswith("what its heights count from")
         assert told["not_loaded"] == []
         with pytest.raises(LookupError, match=r"did you mean example-scanner\?"):
             find_driver("scanner", "exmaple-scanner")
+
+    def test_the_list_of_commands_looks_for_no_driver(self) -> None:
+        code = (
+            "import sys; from swath.daemon.cli.main import run_app; run_app(['--help']); "
+            "sys.exit('swath.drivers.plugins' in sys.modules)"
+        )
+        assert subprocess.run([sys.executable, "-c", code], stdout=subprocess.DEVNULL, check=False).returncode == 0
 
     def test_a_package_that_cannot_be_imported_costs_no_other_device(
         self, site: Site, capsys: pytest.CaptureFixture[str]
