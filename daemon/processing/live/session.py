@@ -22,6 +22,7 @@ from swath.daemon.log.reader import Session
 from swath.daemon.log.session import read_boot_id
 from swath.daemon.processing.carried_verdict import calibration_verdicts, verdict_entry
 from swath.daemon.processing.live.follow import LiveFollower, LivePart, Skipped
+from swath.daemon.processing.live.lines import LINES, LiveLines
 from swath.daemon.processing.live.points import PointsFile
 from swath.daemon.processing.live.products import LiveProducts, Room
 from swath.daemon.processing.live.status import LiveStatus, sentence, write_status
@@ -66,6 +67,7 @@ class LiveSession:
     Attributes:
         now_ns: host time up to which the log has been read; a live session uses the clock instead.
         verdict: verdict on the calibrations, for the status.
+        lines: the state of the lines.
     """
 
     def __init__(
@@ -93,7 +95,9 @@ class LiveSession:
         self._stream = setup.live_stream(info)
         self._path = _SeenPath(self._stream.path)
         self._stream.path = self._path
-        self._feed = LogFeed(setup, self._stream)
+        self.lines = LiveLines(setup, self._stream, folder)
+        self._feed = LogFeed(setup, self._stream, self.lines)
+        self.lines.parser = self._feed.parser
         if setup.sources.ins_source is None and self._feed.navigator is None:
             raise UserError(
                 f"{info.session_id}: the configuration has neither a device with an INS solution nor both an IMU and "
@@ -123,6 +127,15 @@ class LiveSession:
             self._give(placed, live=live)
         self.products.take_pose(self._path.trajectory, self.now_ns)
         self.products.save_map({"session_id": self.info.session_id}, self.now_ns)
+        self._save_lines()
+
+    def _save_lines(self, *, last: bool = False) -> None:
+        """Write the state of the lines, unless free space is low."""
+        if self.products.room.is_enough:
+            try:
+                self.lines.save(self.now_ns, last=last)
+            except OSError as error:
+                self.products.trouble = f"{LINES}: {error.strerror or error}: the lines are not written"
 
     def _gps_from_host(self, host_ns: int) -> int | None:
         """Return the GPS time of a host time by the clock of the first scanner that has one; None: there is none."""
@@ -154,6 +167,7 @@ class LiveSession:
         self.look_for_room()
         self.products.map.end()
         self.products.save_map({"session_id": self.info.session_id}, self.now_ns, last=True)
+        self._save_lines(last=True)
         self.products.close()
         if self.points is not None:
             self.points.close()
@@ -275,7 +289,7 @@ class Live:
         if self._session is not None:
             now_ns = self._session.host_now_ns(live=True)
             found |= {"time_ns": now_ns, "verdict": self._session.verdict}
-            found |= self._session.status.plain(self._follower, now_ns)
+            found |= self._session.status.plain(self._follower, now_ns) | self._session.lines.plain_status()
             if self._session.points is not None and self._session.points.trouble:
                 found["points_file"] = self._session.points.trouble
         found["sentence"] = one_line(sentence(found))
@@ -350,7 +364,7 @@ def replay(
         about = {"session_id": session.session_id, "part": session.parts[-1].number}
         run.products.save_coverage(about)
         found: Told = {"state": "replayed", **about, "time_ns": run.now_ns, "verdict": run.verdict}
-        found |= run.status.plain(None, run.now_ns)
+        found |= run.status.plain(None, run.now_ns) | run.lines.plain_status()
         found["damaged_chunks"] = len(session.damage)
         found["sentence"] = one_line(sentence(found))
         write_status(folder, found)

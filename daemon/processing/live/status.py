@@ -31,6 +31,7 @@ WINDOW_S = 10.0  # period that latencies are reported for
 EVERY = 97  # one of so many of a block's points is timed
 LATE_S = 1.0
 ASK_NS = 1_000_000_000
+SHOWN_LINES = 6  # to be flown again, in the sentence
 LATENCIES = ("p50", "p95", "max")
 
 
@@ -222,6 +223,7 @@ def sentence(found: dict[str, Any]) -> str:
     if worst_s is not None:
         late = "LATE: " if worst_s > LATE_S else ""
         parts.append(f"{late}{worst_s:.2f} s behind the pulse")
+    parts += _lines(found.get("lines") or {})
     left_out = Counter[str]()
     for fates in found["fates"].values():
         left_out.update({fate: count for fate, count in fates.items() if fate != "georeferenced"})
@@ -233,6 +235,20 @@ def sentence(found: dict[str, Any]) -> str:
     parts += [*found.get("without_time", []), *_not_locked(found)[:3]]
     parts += [str(found[key]) for key in ("trouble", "points_file") if found.get(key)]
     return "; ".join(parts)
+
+
+def _lines(lines: dict[str, Any]) -> list[str]:
+    """Return the line that is flown, and those to be flown again, in words."""
+    parts = [f"on {_named(lines['current'])}"] if lines.get("current") else []
+    again = lines.get("fly_again") or []
+    if again:
+        more = f" and {len(again) - SHOWN_LINES} more" if len(again) > SHOWN_LINES else ""
+        parts.append(f"FLY AGAIN: {', '.join(again[:SHOWN_LINES])}{more}")
+    return [*parts, *([lines["trouble"]] if lines.get("trouble") else [])]
+
+
+def _named(name: str) -> str:
+    return name if name.startswith("strip ") else f"line {name}"
 
 
 def is_well(found: dict[str, Any]) -> bool:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from swath.daemon.processing.navigation.live import Navigator, navigator_of
 from swath.daemon.processing.points.runs import Run
 from swath.daemon.processing.setup.models import connect
 from swath.daemon.processing.setup.setup import Setup
-from swath.drivers.parser import Parser
+from swath.drivers.parser import DeviceKind, Parser
 from swath.georef.arrays import BoolArray, StructArray
 from swath.georef.points import Points
 from swath.georef.records import (
@@ -46,24 +47,40 @@ def _any_status(status: NDArray[np.uint32]) -> BoolArray:
     return np.ones(len(status), np.bool_)
 
 
+class FeedWatch(Protocol):
+    """Sees what a feed takes, in the order of the log and with its ticks; the points do not depend on it."""
+
+    def taker(self, topic: str) -> Callable[[LogBatch], None] | None:
+        """Return the function that takes the messages of a topic that the feed does not use; None: not wanted."""
+
+    def record(self, source: str, record: Record) -> None:
+        """Take a record of a source."""
+
+    def tick(self, tick_ns: int | None, placed: Placed) -> None:
+        """Take the points that became final at a tick; None: at the end of the log."""
+
+
 class LogFeed:
     """Feeds one session's log into a stream.
 
     Args:
         setup: makes the sources' parsers.
         stream: stream made by `Setup.stream`; its clocks are the session's.
+        watch: sees everything too; receivers are then decoded whole.
 
     Attributes:
         counts: by source, number of records taken and of those left out.
         fixes: by source, the newest position of its first antenna.
     """
 
-    def __init__(self, setup: Setup, stream: Stream) -> None:
+    def __init__(self, setup: Setup, stream: Stream, watch: FeedWatch | None = None) -> None:
         self.stream = stream
+        self._watch = watch
         self.counts: dict[str, Counter[str]] = {}
         self.fixes: dict[str, GnssFix] = {}
         self._setup = setup
-        self._parsers = setup.sources.parsers(("gnss", "scanner")) | setup.sources.ins_parser()
+        kinds: tuple[DeviceKind, ...] = ("gnss", "scanner")
+        self._parsers = setup.sources.parsers(kinds, whole=watch is not None) | setup.sources.ins_parser()
         # for a growing log, until the device's own INS has a solution
         self.navigator: Navigator | None = None
         if not stream.clocks.frozen:
@@ -97,7 +114,10 @@ class LogFeed:
             if tick_ns is not None:
                 self.flush()
                 self._navigate(tick_ns)
-                placed += self.stream.advance(tick_ns)
+                given = self.stream.advance(tick_ns)
+                placed += given
+                if self._watch is not None:
+                    self._watch.tick(tick_ns, given)
         return placed
 
     def _navigate(self, tick_ns: int | None) -> None:
@@ -117,7 +137,10 @@ class LogFeed:
         for source, parser in self._parsers.items():
             self._take_records(source, parser.close())
         self._navigate(None)
-        return self.stream.close()
+        placed = self.stream.close()
+        if self._watch is not None:
+            self._watch.tick(None, placed)
+        return placed
 
     def parser(self, source: str) -> Parser:
         """Return the parser of a source (``scanner/left``), for its counters."""
@@ -165,7 +188,7 @@ class LogFeed:
             return self._take_readings
         source = source_of_topic(topic)
         if source is None:
-            return None
+            return None if self._watch is None else self._watch.taker(topic)
         if source.startswith("pps/"):
             edge = self._setup.sources.edge_of(source)
             return None if edge is None else lambda batch: self._take_edges(source, edge, batch)
@@ -208,6 +231,8 @@ class LogFeed:
             counts[type(record).__name__] += 1 if rows is None else len(rows)
             if isinstance(record, GnssFix) and record.lat_rad is not None and record.antenna == "primary":
                 self.fixes[source] = record
+            if self._watch is not None:
+                self._watch.record(source, record)
             if isinstance(record, ScannerReturns):
                 self._take_returns(source, record.rows)
             elif isinstance(record, TimeMessage) and source in clocks.host.plan.gnss:

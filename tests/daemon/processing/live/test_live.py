@@ -63,7 +63,9 @@ class Flown:
             (folder / name).write_bytes(data)
         text = config_text(plan, default_wires(plan), "logs").replace("[session]", "[session]\nsplit_minutes = 0.035")
         text = text.replace('protocol = "novatel"', 'protocol = "novatel"\ndatum = "same"')
-        (folder / "swath.toml").write_text(text)
+        # the log ends before the flight's first line begins: the plan of lines has it begin sooner
+        (folder / "plan.toml").write_text(PLAN.replace("from_m = [-150, 0]", "from_m = [-650, 0]"))
+        (folder / "swath.toml").write_text(text + '[plan]\nfile = "plan.toml"\n')
         self.config: Config = load_config(folder / "swath.toml")
         report = fly_into_log(self.config, folder / "logs", flight, plan.tables.flight.seed)
         self.paths = report.paths
@@ -152,6 +154,7 @@ class TestPoints:
         assert told[-1]["state"] == "ended (the recording has ended)"
         assert told[-1]["live_skipped_s"] == 0.0
         assert (tmp_path / "points.npy").read_bytes() == (replayed[0] / "points.npy").read_bytes()
+        assert (tmp_path / "live/lines.json").read_bytes() == (replayed[0] / "lines.json").read_bytes()
         assert json.loads((tmp_path / "live/live.json").read_text()) == told[-1]
         assert sorted({int(one["part"]) for one in told if "part" in one}) == list(range(len(flown.paths)))
 
@@ -168,7 +171,7 @@ class TestPoints:
                     first = last
 
         replay(flown.session(), flown.setup(), tmp_path, LiveConfig(), tmp_path / "points.npy", batches=cut())
-        for name in ("points.npy", "coverage.png"):
+        for name in ("points.npy", "coverage.png", "lines.json"):
             assert (tmp_path / name).read_bytes() == (replayed[0] / name).read_bytes(), name
 
     def test_points_after_skipped_chunks_are_unchanged(
@@ -216,6 +219,25 @@ class TestStatus:
         assert coverage["points"] == sum(found["points"].values())
         # two scanners with 8000 pulses/s together at 50 m/s: pulses divided by their area
         assert 0.5 < coverage["density_per_m2"]["mean"] < 20.0
+
+    def test_the_plan_stored_in_the_log_gives_the_state_of_its_lines(self, replayed: tuple[Path, Told]) -> None:
+        """The flight of 7 s, at 50 m/s, ends 250 m before x = -150 m, the begin of the line that it makes for."""
+        folder, found = replayed
+        lines = json.loads((folder / "lines.json").read_text())
+        assert (lines["plan"], lines["current"], lines["trouble"]) == ("plan.toml", None, "")
+        one, two = lines["lines"]
+        assert (one["name"], one["state"], two["state"]) == ("1", "again", "planned")
+        assert [(reason["code"], reason["grave"]) for reason in one["reasons"]] == [
+            ("early_end", True),
+            ("time", False),
+        ]
+        assert one["flown_from_m"] == 0.0
+        assert one["flown_to_m"] == pytest.approx(250.0, abs=25.0)
+        assert len(lines["geometry"]["lines"]["1"]) == 2
+        assert found["lines"]["fly_again"] == ["1"]
+        assert "FLY AGAIN: 1;" in found["sentence"] + ";"
+        assert found["gnss"]["gnss/rover"]["fix"] == "rtk_fixed"
+        assert found["pose"]["speed_mps"] == pytest.approx(50.0, abs=1.0)
 
     def test_one_sentence_names_the_problem(self, replayed: tuple[Path, Told]) -> None:
         found = dict(replayed[1])

@@ -1,0 +1,344 @@
+"""Watch a flight: which line is flown, how to steer, and the state of each line.
+
+All decisions depend on the poses and moments that come in, never on a clock, so that a replay gives the same states.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from swath.daemon.config.tables import PlanConfig
+from swath.daemon.processing.flightplan.geometry import LineGeometry, Places
+from swath.daemon.processing.flightplan.judge import Limits
+from swath.daemon.processing.flightplan.lines import Line, Overrule, Pass, parsed_overrule, plain_line
+from swath.daemon.processing.flightplan.moments import SETTLE_NS
+from swath.daemon.processing.flightplan.overlap import overlap_reasons
+from swath.daemon.processing.flightplan.plan import FlightPlan
+from swath.georef.arrays import BoolArray, FloatArray, StructArray
+from swath.georef.timescales.gps_time import SECOND_NS
+
+ALIGNED_RAD, STILL_ALIGNED_RAD = math.radians(20.0), math.radians(35.0)  # between track and line
+REACH_TOLERANCES, LEAST_REACH_M = 5.0, 100.0  # how far beside a line it still counts as flown, and badly
+NEARER = 0.5  # another line takes over if it is this much nearer
+REVERSE_M = 10.0  # of two lines at one place, the one whose direction is flown counts
+AWAY_NS = 3 * SECOND_NS  # off a line for less, the pass goes on
+SLOWEST_MPS = 1.0  # slower, the track has no direction
+FIXED = 3  # quality of a position, as in `MOMENT_DTYPE`
+APPROACH_RAD, APPROACH_M, APPROACH_ACROSS_M = math.radians(45.0), 20_000.0, 2_000.0
+
+
+@dataclass(slots=True)
+class Steering:
+    """How to steer; lengths on the ellipsoid.
+
+    Attributes:
+        line, is_reverse: the line to be flown, and against its own direction.
+        cross_track_m: positive: the aircraft is to the right of the line, as seen in the direction of flight.
+        height_m: above the planned height; nan: none is planned.
+        track_error_deg: direction of flight minus that of the line.
+        to_begin_m, to_end_m: to the line's begin, 0 once it is passed, and to its end.
+        speed_mps, wanted_speed_mps, bank_deg: nan where nothing is wanted.
+    """
+
+    line: str
+    is_reverse: bool
+    cross_track_m: float
+    height_m: float
+    track_error_deg: float
+    to_begin_m: float
+    to_end_m: float
+    speed_mps: float
+    wanted_speed_mps: float
+    bank_deg: float
+
+    def plain(self, bank_limit_deg: float) -> dict[str, Any]:
+        """Return plain values for ``lines.json``."""
+        slow = self.speed_mps < SLOWEST_MPS
+        numbers = {
+            "cross_track_m": self.cross_track_m,
+            "height_m": self.height_m,
+            "track_error_deg": self.track_error_deg,
+            "to_begin_m": self.to_begin_m,
+            "to_end_m": self.to_end_m,
+            "to_begin_s": math.nan if slow else self.to_begin_m / self.speed_mps,
+            "to_end_s": math.nan if slow else self.to_end_m / self.speed_mps,
+            "speed_mps": self.speed_mps,
+            "wanted_speed_mps": self.wanted_speed_mps,
+            "bank_deg": self.bank_deg,
+            "bank_limit_deg": bank_limit_deg,
+        }
+        told = {key: round(value, 2) if math.isfinite(value) else None for key, value in numbers.items()}
+        return {"line": self.line, "reverse": self.is_reverse, **told}
+
+
+def _turned(angle_rad: Any) -> Any:
+    """Return angles as −π … π."""
+    return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
+
+
+class LineWatch:
+    """Watches the lines of a plan.
+
+    Args:
+        plan: with at least one line.
+        config: table ``[plan]``, for the tolerances and what is wanted.
+
+    Attributes:
+        lines: in the order of the plan.
+        current: the line that is flown now; None: none.
+        steering: to the line that is flown, or that comes next; None: before the first pose, or nothing is left to fly.
+    """
+
+    def __init__(self, plan: FlightPlan, config: PlanConfig) -> None:
+        self.plan, self._config = plan, config
+        self.geometry = LineGeometry(plan.lines)
+        self.lines = [
+            Line(line.name, float(length_m), Limits.of(config, line.speed_mps))
+            for line, length_m in zip(plan.lines, self.geometry.length_m, strict=True)
+        ]
+        self.current: Pass | None = None
+        self.steering: Steering | None = None
+        self._passes: dict[int, Pass] = {}  # by number, until they are settled
+        self._count = 0
+        self._best_fix = 0
+        self._last_line: int | None = None
+        self._reach_m = max(REACH_TOLERANCES * config.tolerance.cross_track_m, LEAST_REACH_M)
+
+    # ------------------------------------------------------------------ poses
+
+    def poses(self, rows: StructArray) -> StructArray:
+        """Take the newest poses (n,), and return them with the lines that they are flown on, for `moments`."""
+        rows = rows.copy()
+        if not len(rows):
+            return rows
+        self._best_fix = mark_fixes(rows, self._config, self._best_fix)
+        places = self.geometry.places(rows["lat_rad"], rows["lon_rad"])
+        off = _turned(rows["track_rad"][:, np.newaxis] - places.azimuth_rad)
+        inside = (places.along_m >= 0.0) & (places.along_m <= self.geometry.length_m)
+        inside &= rows["speed_mps"][:, np.newaxis] >= SLOWEST_MPS
+        across = np.abs(places.across_m)
+        on = self._on(off, inside, across, ALIGNED_RAD, self._reach_m)
+        keeps = self._on(off, inside, across, STILL_ALIGNED_RAD, 1.5 * self._reach_m)
+        above: FloatArray = np.abs(rows["height_m"][:, np.newaxis] - places.height_m)
+        cost = across + np.where(np.isnan(above), 0.0, above) + REVERSE_M * (np.abs(off) > math.pi / 2)
+        least = np.argmin(np.where(on, cost, np.inf), axis=1)
+        any_on: BoolArray = np.logical_or.reduce(on, axis=1)
+        for place in range(len(rows)):
+            best = int(least[place]) if any_on[place] else None
+            self._choose(int(rows["gps_ns"][place]), off[place], keeps[place], cost[place], best)
+            if self.current is not None:
+                line = self.current.line
+                rows["run"][place], rows["along_m"][place] = self.current.number, places.along_m[place, line]
+                rows["across_m"][place], rows["planned_m"][place] = (
+                    places.across_m[place, line],
+                    places.height_m[place, line],
+                )
+                rows["planned_above_m"][place] = places.above_ground_m[place, line]
+        last = len(rows) - 1
+        newest = Places(*(getattr(places, one.name)[last:] for one in fields(Places)))
+        self.steering = self._steer(rows[last:], newest)
+        return rows
+
+    def _choose(self, gps_ns: int, off: FloatArray, keeps: BoolArray, cost: FloatArray, best: int | None) -> None:
+        """Find the line that is flown, and begin or end a pass; arrays (lines,)."""
+        if self.current is not None:
+            line = self.current.line
+            same_way = (abs(off[line]) > math.pi / 2) == self.current.is_reverse
+            nearer = best is not None and best != line and cost[best] < NEARER * cost[line]
+            if keeps[line] and same_way and not nearer:
+                return
+            self.current.left_ns = gps_ns
+            self.lines[line].is_new = True
+            self._last_line, self.current = line, None
+        if best is None:
+            return
+        is_reverse = bool(abs(off[best]) > math.pi / 2)
+        earlier = self.lines[best].passes[-1] if self.lines[best].passes else None
+        if (
+            earlier is not None
+            and earlier.left_ns is not None
+            and earlier.is_reverse == is_reverse
+            and gps_ns - earlier.left_ns < AWAY_NS
+        ):
+            earlier.left_ns, self.current = None, earlier
+            return
+        self._begin(gps_ns, best, is_reverse=is_reverse)
+
+    def _begin(self, gps_ns: int, line: int, *, is_reverse: bool) -> None:
+        self.current = Pass(self._count, line, is_reverse, gps_ns)
+        self._count += 1
+        self._passes[self.current.number] = self.current
+        flown = self.lines[line]
+        flown.passes.append(self.current)
+        flown.is_new = True
+        if flown.overrule is not None and flown.overrule.verdict == "again":
+            flown.overrule = None  # it is being done
+
+    @staticmethod
+    def _on(off: FloatArray, inside: BoolArray, across: FloatArray, aligned_rad: float, reach_m: float) -> BoolArray:
+        angle = np.minimum(np.abs(off), math.pi - np.abs(off))
+        found: BoolArray = inside & (angle <= aligned_rad) & (across <= reach_m)
+        return found
+
+    # ------------------------------------------------------------------ steering
+
+    def _steer(self, row: StructArray, places: Places) -> Steering | None:
+        speed_mps, track = float(row["speed_mps"][0]), float(row["track_rad"][0])
+        if self.current is not None:
+            line, is_reverse = self.current.line, self.current.is_reverse
+        else:
+            found = self._approached(places, track)
+            if found is None:
+                return None
+            line, is_reverse = found
+        length_m = float(self.geometry.length_m[line])
+        along, across = float(places.along_m[0, line]), float(places.across_m[0, line])
+        azimuth = float(places.azimuth_rad[0, line]) + (math.pi if is_reverse else 0.0)
+        flown_m = length_m - along if is_reverse else along
+        to_begin = math.hypot(flown_m, across) if flown_m < 0.0 else 0.0
+        to_end = math.hypot(length_m - flown_m, across) if flown_m > length_m else length_m - flown_m
+        limits = self.lines[line].limits
+        planned = float(places.height_m[0, line])
+        return Steering(
+            self.lines[line].name,
+            is_reverse,
+            -across if is_reverse else across,
+            float(row["height_m"][0]) - planned,
+            math.degrees(float(_turned(track - azimuth))),
+            to_begin,
+            to_end,
+            speed_mps,
+            limits.wanted_speed_mps,
+            math.degrees(float(row["roll_rad"][0])),
+        )
+
+    def _approached(self, places: Places, track_rad: float) -> tuple[int, bool] | None:
+        """Return the line to be flown next, and its direction: one ahead, or the next of the plan."""
+        left = np.array([line.state in ("planned", "again") for line in self.lines])
+        if not left.any():
+            return None
+        length = self.geometry.length_m
+        along, across = places.along_m[0], np.abs(places.across_m[0])
+        off = np.abs(_turned(track_rad - places.azimuth_rad[0]))
+        ahead_m = np.where(off <= APPROACH_RAD, -along, np.where(off >= math.pi - APPROACH_RAD, along - length, -1.0))
+        ahead = left & (ahead_m >= 0.0) & (ahead_m <= APPROACH_M) & (across <= APPROACH_ACROSS_M)
+        if ahead.any():
+            line = int(np.argmin(np.where(ahead, np.hypot(ahead_m, across), np.inf)))
+            return line, bool(off[line] >= math.pi - APPROACH_RAD)
+        line = self._following(left, self._last_line)
+        return line, bool(along[line] > length[line] / 2.0)
+
+    @staticmethod
+    def _following(left: BoolArray, last: int | None) -> int:
+        """Return the first line after the last one flown that has to be flown."""
+        start = 0 if last is None else last + 1
+        order = [*range(start, len(left)), *range(min(start, len(left)))]
+        return int(next(line for line in order if left[line]))
+
+    @property
+    def next_line(self) -> str | None:
+        """Name of the line to be flown after the present one; None: none is left."""
+        if self.current is None and self.steering is not None:
+            return self.steering.line
+        left = np.array([line.state in ("planned", "again") for line in self.lines])
+        last = self._last_line
+        if self.current is not None:
+            left[self.current.line], last = False, self.current.line
+        return self.lines[self._following(left, last)].name if left.any() else None
+
+    # ------------------------------------------------------------------ moments
+
+    def moments(self, rows: StructArray) -> None:
+        """Take moments (n,) whose returns are complete, in the order of time."""
+        if not len(rows):
+            return
+        numbers = rows["run"]
+        edges = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(rows)]
+        for start, end in pairwise(edges):
+            one = self._passes.get(int(numbers[start]))
+            if one is not None:
+                one.rows.append(rows[start:end])
+                self.lines[one.line].is_new = True
+        newest_ns = int(rows["gps_ns"][-1])
+        for number, one in list(self._passes.items()):
+            if one.left_ns is not None and newest_ns > one.left_ns + AWAY_NS + SETTLE_NS:
+                one.is_settled = True
+                del self._passes[number]
+
+    def close(self) -> None:
+        """End the pass that is being flown: no more moments come."""
+        if self.current is not None:
+            rows = self.current.moments()
+            self.current.left_ns = int(rows["gps_ns"][-1]) if len(rows) else self.current.begin_ns
+            self.lines[self.current.line].is_new = True
+        self.current = self.steering = None
+
+    def overrule(self, text: str, time_ns: int) -> bool:
+        """Take the operator's note, ``line NAME: accepted, NOTE``; return whether it is one."""
+        line, verdict, note = parsed_overrule(text, [line.name for line in self.lines])
+        if line is None:
+            return False
+        self.lines[line].overrule = Overrule(verdict, note, time_ns) if verdict else None
+        return True
+
+    # ------------------------------------------------------------------ result
+
+    def refresh(self) -> None:
+        """Judge all lines anew that have something new."""
+        changed = any(line.is_new for line in self.lines)
+        for line in self.lines:
+            line.refresh()
+        if changed and self._config.wanted.overlap_percent is not None:
+            overlap_reasons(self.geometry, self.plan.lines, self.lines, self._config)
+
+    def plain(self) -> dict[str, Any]:
+        """Return the state of all lines as plain values, without the geometry."""
+        self.refresh()
+        current = None if self.current is None else self.current.line
+        bank_deg = self._config.tolerance.bank_deg
+        return {
+            "plan": self.plan.name,
+            "lines": [plain_line(line, is_flying=place == current) for place, line in enumerate(self.lines)],
+            "current": None if current is None else self.lines[current].name,
+            "next": self.next_line,
+            "steering": None if self.steering is None else self.steering.plain(bank_deg),
+        }
+
+    def plain_geometry(self) -> dict[str, Any]:
+        """Return the lines and the area in degrees, for maps."""
+        return {
+            "lines": {
+                line.name: [
+                    [round(lat, 8), round(lon, 8), None if math.isnan(height) else round(height, 2)]
+                    for lat, lon, height in zip(
+                        line.lat_deg.tolist(), line.lon_deg.tolist(), line.height_m.tolist(), strict=True
+                    )
+                ]
+                for line in self.plan.lines
+            },
+            "area": [[ring.round(8).tolist() for ring in polygon] for polygon in self.plan.area],
+        }
+
+
+def mark_fixes(rows: StructArray, config: PlanConfig, best: int) -> int:
+    """Note in poses (n,) whether positions are as good as wanted.
+
+    Args:
+        rows: poses, changed in place.
+        config: table ``[plan]``.
+        best: best quality before them.
+
+    Returns:
+        The best quality so far.
+    """
+    reached = np.maximum.accumulate(np.maximum(rows["fix"], best))
+    wanted = np.where(reached >= FIXED, FIXED, 1)
+    if config.wanted.fix != "auto":
+        wanted = np.full(len(rows), {"any": 1, "float": 2, "fixed": FIXED}[config.wanted.fix])
+    rows["is_fixed_enough"] = np.where(rows["fix"] < 0, -1, rows["fix"] >= wanted)
+    return int(reached[-1])
