@@ -6,6 +6,8 @@ no byte order for the identifier; in the log it is little-endian.
 
 from __future__ import annotations
 
+import struct
+
 import numpy as np
 
 from swath.georef.arrays import StructArray
@@ -21,6 +23,7 @@ CAN_FRAME_BYTES = 16  # CAN_MTU
 CANFD_FRAME_BYTES = 72  # CANFD_MTU
 CANFD_FDF = 0x04  # flags byte: this is an FD frame
 CANFD_BRS = 0x01  # flags byte: sent with the second bit rate
+CANFD_ESI = 0x02  # flags byte: its sender was error passive
 
 CAN_FRAME_DTYPE = np.dtype(
     [("can_id", "<u4"), ("length", "u1"), ("flags", "u1"), ("reserved", "u1", 2), ("data", "u1", 8)]
@@ -28,6 +31,7 @@ CAN_FRAME_DTYPE = np.dtype(
 CANFD_FRAME_DTYPE = np.dtype(
     [("can_id", "<u4"), ("length", "u1"), ("flags", "u1"), ("reserved", "u1", 2), ("data", "u1", 64)]
 )
+_CLASSIC, _FD = struct.Struct("<IBBxx8s"), struct.Struct("<IBBxx64s")
 CANFD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)  # ISO 11898-1, data length code
 
 
@@ -62,6 +66,33 @@ def encode_can_frame(
     frame["flags"] = CANFD_FDF if fd else 0
     frame["data"][0, : len(data)] = np.frombuffer(data, dtype=np.uint8)
     return frame.tobytes()
+
+
+def data_frame(can_id: int, data: bytes, *, is_fd: bool, flags: int = 0, remote_length: int | None = None) -> bytes:
+    """Return the unit of a frame that a log of another program describes.
+
+    Args:
+        can_id: the identifier with the flag of its format.
+        data: of the frame; "" of a remote request.
+        is_fd: whether it is an FD frame; ``flags`` are then its `CANFD_BRS` and `CANFD_ESI`.
+        remote_length: of a remote request, the length that it asks for.
+
+    Raises:
+        ValueError: the identifier or the data do not fit.
+    """
+    identifier = can_id & ~CAN_EFF_FLAG
+    frame_id(identifier, extended=bool(can_id & CAN_EFF_FLAG))
+    if remote_length is not None:
+        if not 0 <= remote_length <= 8:
+            raise ValueError(f"a remote request asks for at most 8 bytes, not {remote_length}")
+        return _CLASSIC.pack(can_id | CAN_RTR_FLAG, remote_length, 0, b"")
+    if is_fd:
+        if len(data) not in CANFD_LENGTHS:
+            raise ValueError(f"a CAN FD frame cannot carry {len(data)} bytes")
+        return _FD.pack(can_id, len(data), flags | CANFD_FDF, data)
+    if len(data) > 8:
+        raise ValueError(f"a classic CAN frame carries 8 bytes, not {len(data)}")
+    return _CLASSIC.pack(can_id, len(data), 0, data)
 
 
 def decode_can_frames(units: ByteRows) -> StructArray | None:

@@ -55,8 +55,12 @@ IMPORTED_LATE = {
     "swath.daemon.processing.vector_layers": {"shapefile"},  # for shapefiles only
     "swath.daemon.simulate.plans": {"swath.sim"},  # the only import of the virtual aircraft
     "swath.daemon.system": {"psutil"},
-    # rosbags; pyarrow
-    "swath.drivers.captures.opening": {"swath.drivers.captures.rosbag.bag", "swath.drivers.captures.tables"},
+    # asammdf, rosbags, pyarrow
+    "swath.drivers.captures.opening": {
+        "swath.drivers.captures.can",
+        "swath.drivers.captures.rosbag.bag",
+        "swath.drivers.captures.tables",
+    },
     "swath.drivers.imu.dbc.signals": {"cantools.database"},
     "swath.drivers.scanner.rows.filler": {"swath.drivers.scanner.rows.compiled"},  # numba
     "swath.drivers.scanner.velodyne.calibration": {"yaml"},

@@ -9,9 +9,10 @@ import math
 import os
 import resource
 from collections.abc import Callable, Sequence
-from datetime import UTC, datetime
+from datetime import UTC, datetime, tzinfo
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import typer
 
@@ -37,8 +38,7 @@ def command(
     files: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="FILE…",
-            help="pcap, pcapng, candump -L, lvx, lvx2, CSV or Parquet files, bags, or the folder of an export.",
+            metavar="FILE…", help="Captures, logs of CAN buses, CSV or Parquet files, bags, or the folder of an export."
         ),
     ] = None,
     output: Annotated[Path | None, typer.Option("--output", "-o", metavar="DIR", help="Directory for the log.")] = None,
@@ -49,6 +49,10 @@ def command(
     start: Annotated[
         list[str] | None,
         typer.Option(metavar="[SOURCE=]TIME", help="Start time of a file without times, such as 2026-11-21T10:15:00Z."),
+    ] = None,
+    zone: Annotated[
+        str | None,
+        typer.Option(metavar="ZONE", help="Zone of files with local times: +02:00 or Europe/Zurich. Default: UTC."),
     ] = None,
     baud: Annotated[
         list[str] | None,
@@ -62,9 +66,9 @@ def command(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, for scripts.")] = False,
 ) -> None:
-    """Make a log from captures of tcpdump, candump, str2str, Livox Viewer, ROS bags, tables, or an export.
+    """Make a log from captures of tcpdump, str2str, Livox Viewer or CAN loggers, ROS bags, tables, or an export.
 
-    CONFIG's UDP ports and CAN interfaces assign the units of pcap files and candump logs to devices; a serial stream
+    CONFIG's ports and CAN interfaces assign the units of network captures and CAN logs to devices; a serial stream
     needs --source. The topics of a bag go to the devices of their protocols, or are named by --source. Exit code 4 when
     a capture is damaged, 1 when a capture holds nothing from CONFIG's devices.
     """
@@ -79,7 +83,9 @@ def command(
     if output is None:
         raise UserError("import: want -o DIR, the directory for the log (or --list BAG)", ExitCode.USAGE)
     logging.getLogger("swath").addHandler(logging.NullHandler())  # findings about captures are printed below
-    options = ImportOptions(source or (), _by_source(start, _time_ns), _by_source(baud, _baud), keep_copies)
+    options = ImportOptions(
+        source or (), _by_source(start, _time_ns), _by_source(baud, _baud), keep_copies, _zone(zone)
+    )
     loaded = load_config(config)
     routes = Routes.of(loaded)
     captures = find_captures(routes, files or (), options)
@@ -174,6 +180,18 @@ def _time_ns(text: str) -> int:
     return (since.days * 86_400 + since.seconds) * 1_000_000_000 + since.microseconds * 1000
 
 
+def _zone(text: str | None) -> tzinfo | None:
+    """Parse an offset from UTC such as +02:00, or the name of a time zone."""
+    if text is None:
+        return None
+    with contextlib.suppress(ValueError):
+        if offset := datetime.fromisoformat(f"2000-01-01T00:00:00{text}").tzinfo:
+            return offset
+    with contextlib.suppress(ValueError, OSError, ZoneInfoNotFoundError):
+        return ZoneInfo(text)
+    raise UserError(f"--zone {text}: want an offset such as +02:00, or a zone such as Europe/Zurich", ExitCode.USAGE)
+
+
 def _baud(text: str) -> float:
     try:
         value = float(text)
@@ -196,7 +214,7 @@ def _print(report: ImportReport, captures: list[Capture]) -> None:
         print(one_line(f"{capture.path}: {capture.kind}, {', '.join(parts)}"))
         for head in capture.heads.values():
             print(one_line(f"  {head.words()}"))
-        for line in capture.mixed():
+        for line in capture.warnings():
             print(one_line(f"warning: {line}"))
     for path in report.paths:
         print(path)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import tzinfo
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from swath.daemon.errors import ExitCode, UserError, one_line
 from swath.daemon.exchange.bags import BagChoice
-from swath.daemon.exchange.captures import Capture, has_times
+from swath.daemon.exchange.captures import CAN_LOGS, Capture, has_times
 from swath.daemon.exchange.export import MANIFEST
 from swath.daemon.exchange.routes import Port, Routes
 from swath.daemon.exchange.sidecar import SUFFIX
@@ -19,21 +22,24 @@ from swath.daemon.exchange.tables import RECORDS, is_folder_of_tables, settle_ta
 from swath.daemon.log.format import LogError, safe_attachment_path
 from swath.drivers.captures.opening import (
     BareTime,
+    CaptureTally,
+    FileClock,
+    FileTime,
     LvxHead,
     bag_kind,
-    is_candump,
+    can_log_kind,
+    can_log_time,
     is_lvx,
     is_pcap,
-    is_shown_candump,
     is_table,
     read_beginning,
+    read_can_log,
     read_lvx_heads,
     tells_time,
 )
 from swath.drivers.transports.base import TransportError
 
 _LOOKED_AT_BYTES = 65_536
-_LOOKED_AT_LINES = 10
 _MAX_MANIFEST_BYTES = 1 << 20
 _KIND_OF_PORT = {
     "udp": "pcap",
@@ -45,15 +51,23 @@ _KIND_OF_PORT = {
 }
 _FORMS = {
     "pcap": "a pcap file",
-    "candump": "a log of candump -L",
+    "candump": "a log of candump",
+    "asc": "an ASC log",
+    "blf": "a BLF log",
+    "trc": "a TRC trace",
+    "mf4": "an MF4 file",
     "serial": "a file of serial bytes",
     "pps": "a file of edges",
 }
 _NO_CAPTURE = {  # first bytes of files that hold device bytes in a format that cannot be imported
     b"\x89MCAP0\r\n": "MCAP, but no ROS 2 bag",
     b"\x28\xb5\x2f\xfd": "compressed with zstd; of a bag give the folder with its metadata.yaml",
-    b"LOGG": "a BLF file of Vector",
+    b"\x34\xcd\xb2\xa1": "a pcap file of a modified libpcap, which Wireshark's editcap turns into pcapng",
+    b"snoop\0": "a snoop file, which Wireshark's editcap turns into pcapng",
+    b"GMBU": "a file of Network Monitor, which Wireshark's editcap turns into pcapng",
 }
+_READABLE = "pcap, pcapng, candump, ASC, BLF, TRC, MF4, lvx, CSV, Parquet or a ROS bag"
+_LOOKED_AT_FRAMES = 10_000
 _WANTED = (
     "want kind/name=FILE, kind/name:<CAN interface>=FILE, kind/name:<UDP or TCP port>=FILE or kind/name:<topic>=BAG"
 )
@@ -67,12 +81,14 @@ class ImportOptions:
         named: ``kind/name[/aux][:selector]=FILE``, as given.
         start_ns, baud: start time and baud rate of serial files without times, by source, "" for all.
         keep_copies: keep packets that were captured twice.
+        zone: of local times that name no zone; None: not given.
     """
 
     named: Sequence[str] = ()
     start_ns: Mapping[str, int] = field(default_factory=dict)
     baud: Mapping[str, float] = field(default_factory=dict)
     keep_copies: bool = False
+    zone: tzinfo | None = None
 
 
 def find_captures(routes: Routes, files: Sequence[Path], options: ImportOptions) -> list[Capture]:
@@ -93,7 +109,7 @@ def find_captures(routes: Routes, files: Sequence[Path], options: ImportOptions)
     for item in items:
         try:
             for capture in _named(routes, item, bags) if isinstance(item, str) else _found(routes, item, bags):
-                _settle(capture, options)
+                _settle(capture, options, routes)
                 source = capture.port.source if capture.port is not None else ""
                 found[capture.path, source, capture.selector] = capture
         except (UserError, TransportError) as error:
@@ -134,9 +150,9 @@ def _named(routes: Routes, text: str, bags: BagChoice) -> list[Capture]:
             f"{path}: is a pcap file, but {source} uses serial; want a file of serial bytes, or the TCP port that sent "
             f"them: --source {source}:PORT={path}"
         )
-    if port.kind == "pps" if kind == "pcap" else port.kind == "udp":
+    if port.kind == "pps" if kind == "pcap" else port.kind != "can" if kind in CAN_LOGS else port.kind == "udp":
         raise UserError(f"{path}: is {_FORMS[kind]}, but {source} uses {port.kind}; want {_FORMS[wanted]}")
-    return [Capture(path, "pcap" if kind == "pcap" else wanted, port, selector or None)]
+    return [Capture(path, kind if kind == "pcap" or kind in CAN_LOGS else wanted, port, selector or None)]
 
 
 def _port(routes: Routes, source: str, where: str) -> Port:
@@ -164,18 +180,28 @@ def _found(routes: Routes, path: Path, bags: BagChoice) -> list[Capture]:
         if damage:
             raise TransportError(f"{path}: cannot be read: {damage}")
         if other := next((what for magic, what in _NO_CAPTURE.items() if head.startswith(magic)), ""):
-            raise UserError(f"{path}: is {other}; want pcap, candump -L, a bag or the bytes of a device")
-        if any(map(is_shown_candump, _first_lines(head))):
-            raise UserError(f"{path}: is candump's format for people; want the output of candump -L (or -l)")
-        raise UserError(
-            f"{path}: neither pcap nor candump -L; if it holds the bytes of a device, use --source kind/name={path}"
-        )
+            raise UserError(f"{path}: is {other}; want {_READABLE}")
+        raise UserError(f"{path}: is not {_READABLE}; if it holds the bytes of a device, use --source kind/name={path}")
     if kind == "lvx":
         return [_found_heads(routes, path)]
     if routes.described(kind) == "none":
         what = "UDP or TCP port and no CAN bus" if kind == "pcap" else "CAN bus"
         raise UserError(f"{path}: the configuration has no {what} for it")
+    if kind in CAN_LOGS:
+        _refuse_several(path, kind, routes)
     return [Capture(path, kind)]
+
+
+def _refuse_several(path: Path, kind: str, routes: Routes) -> None:
+    """Refuse a log of several numbered channels for a configuration with one bus, which may be any of them."""
+    if kind == "candump" or len(routes.buses()) != 1:
+        return
+    units = read_can_log(path, kind, FileClock(0), CaptureTally())
+    counts = Counter(unit.channel for unit in islice(units, _LOOKED_AT_FRAMES))
+    [bus] = routes.buses()
+    if len(counts) > 1 and not {*counts} & {*routes.bus_names()}:
+        held = ", ".join(f"{channel} ({count})" for channel, count in sorted(counts.items()))
+        raise UserError(f"{path}: holds channels {held}; give --source {bus}:CHANNEL={path}")
 
 
 def _named_heads(path: Path, port: Port, code: str) -> Capture:
@@ -218,23 +244,21 @@ def _listed(heads: Mapping[str, LvxHead]) -> str:
 
 
 def _kind(path: Path, head: bytes) -> str:
-    """Recognise a file by its beginning: pcap, lvx, candump or a bag, else the bytes of a serial line."""
+    """Recognise a file by its beginning: pcap, lvx, a log of a CAN bus or a bag, else the bytes of a serial line."""
     if bag_kind(path, head):
         return "bag"
     if is_pcap(head):
         return "pcap"
     if is_lvx(head):
         return "lvx"
-    return "candump" if any(map(is_candump, _first_lines(head))) else "serial"
+    return can_log_kind(head) or "serial"
 
 
-def _first_lines(head: bytes) -> list[str]:
-    return [line.strip() for line in head.decode("ascii", "replace").splitlines()[:_LOOKED_AT_LINES]]
-
-
-def _settle(capture: Capture, given: ImportOptions) -> None:
+def _settle(capture: Capture, given: ImportOptions, routes: Routes) -> None:
     """Apply the command line's options to a file: its times, and whether copies stay."""
     capture.keep_copies = given.keep_copies
+    if capture.kind in CAN_LOGS:
+        _settle_can(capture, given, routes)
     if capture.kind == "lvx":
         _settle_heads(capture, given)
     if capture.kind != "serial" or has_times(capture.path):
@@ -251,6 +275,23 @@ def _settle(capture: Capture, given: ImportOptions) -> None:
     parity = options.get("parity", "N") != "N"
     bits = 1 + int(options.get("bytesize", 8)) + parity + float(options.get("stopbits", 1))
     capture.time = BareTime(start_ns, baud, bits)
+
+
+def _settle_can(capture: Capture, given: ImportOptions, routes: Routes) -> None:
+    """Find what the times of a log of a CAN bus count from, where it does not tell it in UTC."""
+    told = can_log_time(capture.path, capture.kind)
+    if told is FileTime.NONE:
+        raise UserError(f"{capture.path}: its frames have no times; record with candump -L, or with -t a")
+    sources = [capture.port.source] if capture.port is not None else routes.buses()
+    starts = [given.start_ns[name] for name in (*sources, "") if name in given.start_ns]
+    if told is not FileTime.UTC and not (capture.kind == "candump" and told is FileTime.LOCAL):
+        capture.start_ns = starts[0] if starts else None
+    if told is FileTime.SINCE_BEGIN and capture.start_ns is None:
+        raise UserError(f"{capture.path}: its times count from its beginning, which it does not tell; give --start")
+    if told is FileTime.LOCAL and capture.start_ns is None:
+        capture.zone = given.zone
+        if given.zone is None:
+            capture.notes.append("its times are local times without a zone and were read as UTC; --zone names another")
 
 
 def _settle_heads(capture: Capture, given: ImportOptions) -> None:

@@ -6,6 +6,7 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from datetime import UTC, tzinfo
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,11 +24,12 @@ from swath.drivers.captures.base import (
 )
 from swath.drivers.captures.opening import (
     BareTime,
+    FileClock,
     LvxHead,
     chunk_table,
     read_bag,
     read_bare,
-    read_candump,
+    read_can_log,
     read_lvx,
     read_network,
     read_serial,
@@ -37,6 +39,8 @@ from swath.drivers.captures.opening import (
 from swath.drivers.captures.pcap.writer import NOBODY
 from swath.drivers.transports.base import SENDERS_SHOWN
 from swath.drivers.transports.ntrip import CasterReply
+
+CAN_LOGS = ("candump", "asc", "blf", "trc", "mf4")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,12 +58,14 @@ class Capture:
     """A file to import, its kind, and counts of the units found in it.
 
     Attributes:
-        kind: "pcap", "candump", "serial", "lvx", "bag", "table" or "pps".
+        kind: "pcap", "serial", "lvx", "bag", "table", "pps", or a log of a CAN bus: "candump", "asc", "blf", "trc",
+            "mf4".
         port: the port whose units it holds; None if the units identify their ports themselves.
         selector: the only CAN interface, UDP or TCP port number, or head of an lvx file, whose units are used.
         time: timing of the bytes of a serial file without times.
-        heads: of an lvx file, by code. head_ports: the ports of those that are used, by code. start_ns: of an lvx file
-            whose packages have no UTC, the time at which it begins.
+        heads: of an lvx file, by code. head_ports: the ports of those that are used, by code. start_ns: of a file
+            whose times are not UTC, the time at which it begins. zone: of its local times; None: as UTC, with a note.
+        notes: remarks for the user, one line each.
         topics: of a bag, the topics that are read, with their ports.
         tells_time: the fixes of a table also name seconds, as there is no table of time messages.
         units: number used, by source.
@@ -76,6 +82,8 @@ class Capture:
     heads: Mapping[str, LvxHead] = field(default_factory=dict)
     head_ports: Mapping[str, Port] = field(default_factory=dict)
     start_ns: int | None = None
+    zone: tzinfo | None = None
+    notes: list[str] = field(default_factory=list)
     topics: Mapping[str, Port] = field(default_factory=dict)
     tells_time: bool = True
     tally: CaptureTally = field(default_factory=CaptureTally)
@@ -133,8 +141,10 @@ class Capture:
             assert self.port is not None
             device = self.port.source.partition("/")[0]
             return read_table(self.path, device, tells_time=self.tells_time, tally=self.tally)
-        if self.kind == "candump":
-            return complete(read_candump(self.path, tally=self.tally), self.path, within_ns=1000)
+        if self.kind in CAN_LOGS:
+            clock = FileClock(self.start_ns, self.zone or UTC)
+            units = read_can_log(self.path, self.kind, clock, self.tally)
+            return complete(units, self.path, within_ns=1000) if self.kind == "candump" else units
         if self.kind == "lvx":
             return read_lvx(self.path, self.start_ns, self.tally)
         if self.kind == "pps":
@@ -196,9 +206,9 @@ class Capture:
     def _wants_stream(self, routes: Routes, source: Address, destination: Address) -> bool:
         return self._port_of_stream(routes, source) is not None
 
-    def mixed(self) -> list[str]:
-        """Return a line for each source to which several devices or connections send."""
-        several = [
+    def warnings(self) -> list[str]:
+        """Return the warnings about a file: its notes, and a line for each source to which several devices send."""
+        several = [f"{self.path}: {note}" for note in self.notes] + [
             f"{self.path}: {source}: {mixed_text(senders.counts, recorded=False)}"
             for source, senders in sorted(self.senders.items())
             if senders.mixed and not source.startswith("raw/")
@@ -217,6 +227,7 @@ class Capture:
             "file": str(self.path),
             "kind": self.kind,
             "units": dict(self.units),
+            "notes": self.notes,
             "of_no_device": dict(self.passed),
             "heads": [_plain_head(head) for head in self.heads.values()],
             "mixed_senders": {name: dict(one.counts) for name, one in self.senders.items() if one.mixed},

@@ -15,7 +15,7 @@ from swath.daemon.log.format import ChannelSpec
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.reader import LOOK_AHEAD_BYTES, LOOK_AHEAD_NS
 from swath.drivers.captures.base import LATEST_NS, Address
-from swath.drivers.captures.candump import candump_line, held_by_line
+from swath.drivers.captures.can.candump import candump_line, held_by_line
 from swath.drivers.captures.pcap.writer import (
     FILE_HEADER,
     LATEST_PCAP_NS,

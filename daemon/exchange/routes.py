@@ -125,10 +125,21 @@ class Routes:
         return named[0] if named else found[0] if len(found) == 1 else None
 
     def of_frame(self, unit: CapturedUnit) -> Port | None:
-        """Return the port of a CAN frame by its interface; without a name of the interface, the only bus."""
+        """Return the port of a CAN frame by its interface; without a name of the interface, or with the number that a
+        logger gives its channel, the only bus.
+        """
         if unit.channel in self._can:
             return self._can[unit.channel]
-        return next(iter(self._can.values())) if not unit.channel and len(self._can) == 1 else None
+        is_unnamed = not unit.channel or unit.channel.isdecimal()
+        return next(iter(self._can.values())) if is_unnamed and len(self._can) == 1 else None
+
+    def buses(self) -> list[str]:
+        """Return the sources that are CAN buses."""
+        return [port.source for port in self.ports.values() if port.kind == "can"]
+
+    def bus_names(self) -> list[str]:
+        """Return the names of the interfaces of the CAN buses."""
+        return list(self._can)
 
     def of_heads(self, heads: Iterable[LvxHead]) -> dict[str, Port]:
         """Return the scanners, by code, that are the heads of a file: each is the one with the head's serial number, or

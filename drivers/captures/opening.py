@@ -1,5 +1,5 @@
-"""Readers of recordings that other programs made: pcap and pcapng, ``candump -L`` text, serial bytes with arrival
-times, files of Livox Viewer, bags of ROS.
+"""Readers of recordings that other programs made: pcap and pcapng, logs of CAN buses, serial bytes with arrival times,
+files of Livox Viewer, bags of ROS.
 
 Each yields the units that were on the wire, with the recorder's time, in the file's order; gzip is recognised by its
 magic. They serve import, replay, demonstrations and tests. A damaged file raises `TransportError` with one line, after
@@ -14,7 +14,12 @@ from types import ModuleType
 from typing import TYPE_CHECKING
 
 from swath.drivers.captures.base import Address, CapturedUnit, CaptureTally, open_capture, read_beginning, until_damage
-from swath.drivers.captures.candump import candump_line, held_by_line, is_candump, is_shown_candump, read_candump
+from swath.drivers.captures.can.asc import asc_time, is_asc, read_asc
+from swath.drivers.captures.can.blf import MAGIC as BLF_MAGIC
+from swath.drivers.captures.can.blf import blf_time, read_blf
+from swath.drivers.captures.can.candump import candump_line, candump_time, held_by_line, is_candump, read_candump
+from swath.drivers.captures.can.clock import FileClock, FileTime
+from swath.drivers.captures.can.trc import is_trc, read_trc, trc_time
 from swath.drivers.captures.lvx import LvxHead, is_lvx, read_lvx, read_lvx_heads, tells_time
 from swath.drivers.captures.pcap.files import is_pcap
 from swath.drivers.captures.pcap.reader import read_network, read_pcap
@@ -32,21 +37,24 @@ __all__ = [
     "BareTime",
     "CaptureTally",
     "CapturedUnit",
+    "FileClock",
+    "FileTime",
     "LvxHead",
     "bag_kind",
+    "can_log_kind",
+    "can_log_time",
     "candump_line",
     "chunk_table",
     "held_by_line",
-    "is_candump",
     "is_lvx",
     "is_pcap",
-    "is_shown_candump",
     "is_table",
     "open_bag",
     "open_capture",
     "read_bag",
     "read_bare",
     "read_beginning",
+    "read_can_log",
     "read_candump",
     "read_lvx",
     "read_lvx_heads",
@@ -58,6 +66,58 @@ __all__ = [
     "table_columns",
     "tells_time",
 ]
+
+
+_FIRST_LINES = 10
+_MF4_MAGICS = (b"MDF     ", b"UnFinMF ")
+
+
+def can_log_kind(head: bytes) -> str:
+    """Return the kind of a log of a CAN bus with these first bytes: candump, asc, blf, trc or mf4, or ""."""
+    if head.startswith(BLF_MAGIC):
+        return "blf"
+    if head.startswith(_MF4_MAGICS):
+        return "mf4"
+    lines = [line.strip() for line in head.decode("ascii", "replace").splitlines()[:_FIRST_LINES]]
+    kinds = {"candump": is_candump, "asc": is_asc, "trc": is_trc}
+    return next((kind for kind, is_kind in kinds.items() if any(map(is_kind, lines))), "")
+
+
+def can_log_time(path: Path, kind: str) -> FileTime:
+    """Return the times that a log of a CAN bus tells.
+
+    Raises:
+        TransportError: it cannot be read, or asammdf is not installed.
+    """
+    if kind == "mf4":
+        told: FileTime = _mf4(path).mf4_time(path)
+        return told
+    return {"candump": candump_time, "asc": asc_time, "trc": trc_time, "blf": blf_time}[kind](path)
+
+
+def read_can_log(path: Path, kind: str, clock: FileClock, tally: CaptureTally | None = None) -> Iterator[CapturedUnit]:
+    """Read the frames of a log of a CAN bus of a kind, as the reader of that kind does.
+
+    Raises:
+        TransportError: it cannot be read, does not tell when it begins, or asammdf is not installed; without tally
+            also: it is damaged.
+    """
+    if kind == "candump":
+        return read_candump(path, tally=tally, clock=clock)
+    if kind == "mf4":
+        units: Iterator[CapturedUnit] = _mf4(path).read_mf4(path, clock, tally)
+        return units
+    return {"asc": read_asc, "trc": read_trc, "blf": read_blf}[kind](path, clock, tally)
+
+
+def _mf4(path: Path) -> ModuleType:
+    try:
+        from swath.drivers.captures.can import mf4
+    except ImportError as error:
+        raise TransportError(
+            f"{path}: MF4 files need asammdf, which is not installed: {how_to_install('import')}"
+        ) from error
+    return mf4
 
 
 def open_bag(path: Path) -> Bag:

@@ -8,6 +8,7 @@ import io
 import random
 import tempfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import islice
 from pathlib import Path
 
@@ -20,8 +21,9 @@ from swath.daemon.errors import UserError
 from swath.drivers.captures.base import until_damage
 from swath.drivers.captures.opening import (
     CaptureTally,
+    FileClock,
     open_bag,
-    read_candump,
+    read_can_log,
     read_lvx,
     read_network,
     read_pcap,
@@ -41,6 +43,17 @@ from tests.drivers.captures.bags import (
     fix_message,
     imu_message,
     write_bag,
+)
+from tests.drivers.captures.can_logs import (
+    ASC_HEAD,
+    ASC_LINES,
+    BLF_CLASSIC,
+    BLF_FD_64,
+    BLF_REMOTE,
+    TRC_HEAD,
+    blf_container,
+    blf_file,
+    blf_object,
 )
 from tests.drivers.captures.network import SYN, a_ms_apart, acknowledging, from_device, pcap_of
 from tests.drivers.livox_cases import FILES
@@ -83,7 +96,10 @@ def file_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
     """Yield the targets of capture readers, each with its own kind of file, and of the configuration with its files."""
     yield "pcap", lambda: _captures("pcap", _pcaps(), read_pcap)
     yield "pcap-network", lambda: _captures("pcap-network", _networks(), _read_network)
-    yield "candump", lambda: _captures("candump", _heads("nmea2000/*.log.gz", "canmod-gps/*.log.gz"), read_candump)
+    yield "candump", lambda: _captures("candump", _candumps(), partial(_read_can_log, "candump"))
+    yield "can-asc", lambda: _captures("can-asc", _ascs(), partial(_read_can_log, "asc"))
+    yield "can-blf", lambda: _captures("can-blf", _blfs(), partial(_read_can_log, "blf"))
+    yield "can-trc", lambda: _captures("can-trc", _trcs(), partial(_read_can_log, "trc"))
     yield "lvx", lambda: _captures("lvx", _lvxs(), _read_lvx)
     yield "serial", lambda: _captures("serial", [_serial_case()], _read_serial)
     yield "bag", _bags
@@ -117,6 +133,44 @@ def _networks() -> list[bytes]:
 
 def _read_network(path: Path, tally: CaptureTally | None) -> Iterator[object]:
     return read_network(path, lambda source, destination: source[1] > destination[1] % 40_000, tally)
+
+
+def _candumps() -> list[bytes]:
+    """Return logs of candump, with and without ``-L``, with times of each form."""
+    shown = [
+        f" ({{}})  can0  {rest}\n" for rest in ("120   [2]  01 02   'ab'", "18FF50E5  [12]  " + "07 " * 12, "1{{F}}")
+    ]
+    stamps = ("1700000000.000001", "2023-11-14 23:13:20.000001", "000.000000")
+    texts = ["".join(shown).replace("{}", stamp).encode() for stamp in stamps]
+    return [*_heads("nmea2000/*.log.gz", "canmod-gps/*.log.gz"), *texts]
+
+
+def _ascs() -> list[bytes]:
+    text = ASC_HEAD + ASC_LINES
+    return [text.encode(), text.replace("absolute", "relative").replace("base hex", "base dec").encode()]
+
+
+def _trcs() -> list[bytes]:
+    first = (
+        TRC_HEAD.format("1.1", "").replace(";$COLUMNS=", ";") + "1)  1059.9  Rx  0300  7  00 00 00 00 04 00 00\n" * 3
+    )
+    second = (
+        TRC_HEAD.format("2.1", "N,O,T,B,I,d,R,L,D")
+        + "1 1.0 FB 1 0300 Rx - 9 "
+        + "00 " * 12
+        + "\n2 1.0 RR 1 0300 Rx - 3\n"
+    )
+    return [first.encode(), second.encode()]
+
+
+def _blfs() -> list[bytes]:
+    frames = [blf_object(1, BLF_CLASSIC), blf_object(86, BLF_REMOTE), blf_object(101, BLF_FD_64, version=2)]
+    whole = b"".join(frames)
+    return [blf_file(blf_container(whole[:90]), blf_container(whole[90:])), blf_file(blf_container(whole, 0), *frames)]
+
+
+def _read_can_log(kind: str, path: Path, tally: CaptureTally | None) -> Iterator[object]:
+    return read_can_log(path, kind, FileClock(None if kind in ("asc", "trc") else 0), tally)
 
 
 def _lvxs() -> list[bytes]:

@@ -94,7 +94,7 @@ def test_streams_belong_to_the_device_of_their_address(tmp_path: Path) -> None:
     assert capture.tally.passed["segments of TCP sent to devices"] == 1
     named = ImportOptions([f"gnss/rover:28784={path}"])  # of any address
     report, [capture] = run_import(config, [], tmp_path / "named", named)
-    assert (report.units, capture.mixed()) == ({"gnss/rover": 3}, [])
+    assert (report.units, capture.warnings()) == ({"gnss/rover": 3}, [])
 
 
 def test_a_gap_is_reported_with_its_size(tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_several_connections_at_the_same_time_are_named(tmp_path: Path) -> None:
         frames.append(from_device(100 + 3 * number, b"abc"))
         frames.append(ETHERNET + tcp_packet(DEVICE, Side("10.0.0.9", 1), 100 + 3 * number, b"abc"))
     _, [capture] = run_import(config, [write_frames(tmp_path / "a.pcap", frames)], tmp_path / "logs")
-    [line] = capture.mixed()
+    [line] = capture.warnings()
     assert "gnss/rover: 2 connections at the same time are read as one stream: 192.168.3.1:28784 to 192.168" in line
 
 

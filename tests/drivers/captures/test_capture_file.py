@@ -420,7 +420,7 @@ def test_candump_lines_without_a_frame_are_refused_with_their_line_number(tmp_pa
     path.write_text(f"(1.0) vcan0 123#00\n{line}\n")
     reader = read_candump(path)
     assert next(reader).channel == "vcan0"
-    with pytest.raises(TransportError, match=r"bad.log: line 2 is not a frame of candump -L: \S"):
+    with pytest.raises(TransportError, match=r"bad.log: line 2 is not a frame of candump: \S"):
         next(reader)
 
 
