@@ -124,6 +124,8 @@ ROWS: dict[RowKind, np.dtype[Any]] = {
             *((name, "<f8") for name in ("roll_rad", "pitch_rad", "heading_rad")),
             *((name, "<f4", (3,)) for name in ("position_sigma_l", "velocity_sigma_l", "attitude_sigma_rad")),
             ("status", "<u4"),
+            ("valid", "<u4"),
+            ("reserved", "<u4"),
         ]
     ),
     RowKind.RETURN: np.dtype(

@@ -59,7 +59,7 @@ class RecordsParser(FramedParser):
     """Turns frames into records.
 
     Counts ``bad_version``, ``bad_kind``, ``bad_scale`` and ``bad_length`` of frames with a good CRC; and of rows
-    ``no_time``, fixes and marks without a time that is known, which are left out.
+    ``no_time``, those of a receiver without a time that is known, and ``no_solution``, which are left out.
 
     Args:
         settings: ``acceleration_unit``, if the values are not in the frame's m/s².
@@ -102,7 +102,11 @@ class RecordsParser(FramedParser):
             samples.rows["specific_force_b"] *= self._unit
             yield samples
         elif self._inertial and len(rows) and kind is RowKind.SOLUTION:
-            yield _solutions(rows, host_ns, gps_ns)
+            good = rows["valid"] != 0
+            if not good.all():
+                self.counters.errors["no_solution"] += int((~good).sum())
+            if good.any():
+                yield _solutions(rows[good], host_ns[good], gps_ns[good])
         elif self._receiver and kind in _READERS:
             if scale is Scale.COUNTER:  # which has no date, so that the arrival counts as UTC
                 gps_ns = gps_from_posix(host_ns)

@@ -190,8 +190,10 @@ def test_samples_have_gps_time_with_its_sigma_or_a_counter() -> None:
     [samples] = feed("imu", encode_frame(RowKind.SAMPLE, rows, Scale.COUNTER))
     assert samples.rows["gps_week"].tolist() == [-1] * 3
     assert samples.rows["device_time_ns"].tolist() == [100, 200, -1]
-    solution_rows = rows_of(RowKind.SOLUTION, 2)
+    solution_rows = rows_of(RowKind.SOLUTION, 3)
+    solution_rows["valid"][1] = 0  # of an INS that still aligns
     [solutions] = feed("imu", encode_frame(RowKind.SOLUTION, solution_rows))
+    solution_rows = solution_rows[[0, 2]]
     assert isinstance(solutions, InsSolution)
     for name in ("lat_rad", "velocity_l", "heading_rad", "attitude_sigma_rad", "status"):
         np.testing.assert_array_equal(solutions.rows[name], solution_rows[name])

@@ -21,10 +21,11 @@ from swath.daemon.written import make_folder, note_written
 from swath.drivers.driver import RAW
 from swath.georef.arrays import StructArray
 from swath.georef.progress import Tell, silent
+from swath.georef.trajectory.buffer import SOLUTION_STATUS
 
 MCAP = "mcap"
 FORMATS = ("csv", "parquet", "npz", MCAP)
-RETURNS = "returns"
+RETURNS, SOLUTIONS = "returns", "solutions"
 UNFINISHED = ".part"
 Columns = dict[str, NDArray[Any]]
 
@@ -159,9 +160,20 @@ def _write_source(
         pieces[RETURNS] = records.returns(source, *span)
     for name, rows in pieces.items():
         path = folder / f"{stem}_{name}.{form}"
-        count = _write(path, form, map(_columns, rows))
+        columns: Iterator[Columns] = map(_columns, rows)
+        if name == SOLUTIONS:  # what their status means is known here, and by no reader of the file
+            columns = (_with_validity(one, records.protocol(source)) for one in columns)
+        count = _write(path, form, columns)
         if count:
             written.rows[path.name] = count
+
+
+def _with_validity(columns: Columns, protocol: str) -> Columns:
+    """Return columns of INS solutions with one more, ``valid``: whether the device vouches for the solution."""
+    is_solution = SOLUTION_STATUS.get(protocol)
+    status = columns["status"]
+    valid = np.ones(len(status), np.bool_) if is_solution is None else is_solution(status)
+    return columns | {"valid": valid}
 
 
 def _columns(table: StructArray) -> Columns:

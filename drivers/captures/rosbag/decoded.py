@@ -158,6 +158,7 @@ def _odometry(message: Any) -> list[Unit]:
     """Return attitude and velocity, if the world is east, north, up; positions in an unknown frame are left out."""
     stamp_ns, time_ns, scale = _stamped(message)
     rows = _row(RowKind.SOLUTION, time_ns)
+    rows["valid"] = 1
     pose, twist = message.pose.pose.orientation, message.twist.twist.linear
     quaternion = np.array([pose.w, pose.x, pose.y, pose.z], np.float64)
     length = float(np.linalg.norm(quaternion))

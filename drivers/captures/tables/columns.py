@@ -159,6 +159,7 @@ QUANTITIES: dict[RowKind, list[Quantity]] = {
         *_SIGMAS,
         *_each("attitude_sigma_rad", "angle", ("roll", "pitch", "heading"), "sigma_{}", "{}_sigma", "sd_{}"),
         _STATUS,
+        _VALID,
     ],
     RowKind.HEADING: [
         _HEADING,

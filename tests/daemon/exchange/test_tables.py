@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from swath.daemon.config import load_config
 from swath.daemon.errors import UserError
 from swath.daemon.exchange.capture_files import ImportOptions, find_captures
 from swath.daemon.exchange.routes import Routes
+from swath.daemon.processing.records.files import _with_validity
 from tests.daemon.commands import swath
 from tests.daemon.exchange.builders import run_import, write_config
 from tests.daemon.short_flight import Flown
@@ -134,3 +136,20 @@ def test_a_table_without_a_device_is_refused_in_a_line(tmp_path: Path, config: s
         find_captures(routes, [] if named else [path], options)
     assert words in str(refused.value)
     assert len(str(refused.value).splitlines()) == 1
+
+
+def test_solutions_that_the_device_does_not_vouch_for_are_left_out(tmp_path: Path) -> None:
+    """An INS of NovAtel that aligns sends attitudes of 0; its status is known to the export only."""
+    columns: dict[str, Any] = {"status": np.array([1, 3, 6], np.uint32), "roll_rad": np.zeros(3)}
+    assert _with_validity(columns, "novatel")["valid"].tolist() == [False, True, True]
+    assert _with_validity(columns, "records")["valid"].tolist() == [True, True, True]
+    head = "gps_ns,lat_deg,lon_deg,height_m,roll_deg,pitch_deg,heading_deg,status,valid\n"
+    rows = [f"{1_465_549_218_000_000_000 + n},47,8,500,0,0,{n},{status},{valid}\n" for n, status, valid in LOST]
+    (tmp_path / "ins.csv").write_text(head + "".join(rows))
+    run_import(write_config(tmp_path, CONFIG), [tmp_path / "ins.csv"], tmp_path / "logs")
+    with library.open(tmp_path / "logs") as log:
+        solutions = log["imu/main"].solutions()
+    assert np.degrees(solutions["heading_rad"]).round().tolist() == [2.0, 3.0]
+
+
+LOST = ((1, 1, "false"), (2, 3, "true"), (3, 6, "true"))
