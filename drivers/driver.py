@@ -59,7 +59,15 @@ class UnknownProtocolError(LookupError):
 
 
 class NotLoadedError(UnknownProtocolError):
-    """The driver of that protocol is in another package that cannot be used; the text says why."""
+    """The driver of that protocol is in another package that cannot be used; the text says why.
+
+    Attributes:
+        package: the other package.
+    """
+
+    def __init__(self, text: str, package: Package) -> None:
+        super().__init__(text)
+        self.package = package
 
 
 @cache
@@ -192,7 +200,7 @@ def find_driver(kind: DeviceKind, protocol: str, recorded_with: str = "") -> Dri
     if protocol in plugins.entry_points().of:
         drivers, reasons = _of_package(protocol)
         if reasons:
-            raise NotLoadedError(f"{kind} protocol {protocol!r}: {reasons[0]}")
+            raise NotLoadedError(f"{kind} protocol {protocol!r}: {reasons[0]}", reasons[0].package)
         for driver in drivers:
             if driver.kind == kind:
                 return driver

@@ -29,7 +29,7 @@ def command(
     from swath.daemon.config.findings import configuration_findings
     from swath.daemon.config.geometry import drawing, geometry_lines, placed_devices
 
-    loaded = load_config(config)
+    loaded = load_config(config, to_record=True)
     planned, plan_findings = _planned(loaded)
     findings = [*configuration_findings(loaded), *_crs_findings(loaded), *plan_findings]
     placed = placed_devices(loaded)

@@ -35,7 +35,7 @@ def command(
     from swath.daemon.doctor import Verdict, examine
 
     path = config if config is not None else DEFAULT_CONFIG if DEFAULT_CONFIG.exists() else None
-    loaded = None if path is None else load_config(path)
+    loaded = None if path is None else load_config(path, to_record=True)
     findings = list(examine(loaded, write=write))
     fine = all(finding.verdict is not Verdict.WRONG for finding in findings)
     if as_json:

@@ -35,7 +35,7 @@ def command(
     from swath.daemon.recorder.run import record
 
     _log_to_stderr()
-    loaded = load_config(config)
+    loaded = load_config(config, to_record=True)
     if not any(loaded.device_tables()) and not loaded.pps:
         logging.getLogger("swath").warning("%s: %s", config, NO_SOURCE)
     raise typer.Exit(int(record(loaded, seconds)))

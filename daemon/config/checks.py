@@ -154,13 +154,15 @@ def _check_device(config: Config, kind: DeviceKind, name: str, table: DeviceTabl
     try:
         driver = config.driver_of(kind, table)
     except NotLoadedError as error:
-        yield f'{section}.protocol: {error}; protocol = "raw" records the device meanwhile'
+        yield f"{section}.protocol: {error}; meanwhile swath run records the device as it comes"
         return
     except UnknownProtocolError as error:
         yield f"{section}.protocol: {error}"
         return
+    if f"{kind}/{name}" in config.not_loaded and config.carrier_of(table) is not None:
+        return  # its bytes are in the stream of the other device
     yield from _check_transport(config, section, table, driver)
-    if isinstance(table, ScannerConfig):
+    if isinstance(table, ScannerConfig) and f"{kind}/{name}" not in config.not_loaded:
         yield from _check_clock(section, table, driver)
     wrong = [*_check_needs(section, table, driver), *_check_options(config, kind, name, table, driver)]
     yield from wrong

@@ -24,7 +24,7 @@ from swath.daemon.config.tables import (
     SessionConfig,
     Tables,
 )
-from swath.drivers.driver import Driver, UnknownProtocolError, find_driver
+from swath.drivers.driver import RAW, Driver, NotLoadedError, UnknownProtocolError, find_driver
 from swath.drivers.parser import DeviceKind, DeviceSettings
 from swath.drivers.plugins import Package
 from swath.drivers.transports.spec import TransportSpec, parse_transport
@@ -75,6 +75,7 @@ class Config:
         text: content of the file.
         recorded_with: of a log, name and version of the package whose driver its recorder had, by ``kind/protocol``,
             where that was another one than Swath.
+        not_loaded: of `as_recorded`, what the file's protocols are, and why they cannot be used, by ``kind/name``.
     """
 
     def __init__(self, tables: Tables, path: Path, text: str, recorded_with: Mapping[str, str] | None = None) -> None:
@@ -82,6 +83,7 @@ class Config:
         self.path = path
         self.text = text
         self.recorded_with = dict(recorded_with or {})
+        self.not_loaded: dict[str, tuple[str, NotLoadedError]] = {}
 
     @property
     def session(self) -> SessionConfig:
@@ -193,6 +195,26 @@ class Config:
             UnknownProtocolError: there is none; of a log the text names the package that its recorder had.
         """
         return find_driver(kind, table.protocol, self.recorded_with.get(f"{kind}/{table.protocol}", ""))
+
+    def as_recorded(self) -> Config:
+        """Return the configuration in which devices whose package cannot be loaded have the protocol ``raw``.
+
+        The recorder needs no driver: their bytes are kept, and read when the package works again.
+        """
+        changed: dict[str, dict[str, DeviceTable]] = {}
+        not_loaded = {}
+        for kind, name, table in self.device_tables():
+            try:
+                self.driver_of(kind, table)
+            except NotLoadedError as error:
+                not_loaded[f"{kind}/{name}"] = table.protocol, error
+                table = table.model_copy(update={"protocol": RAW})
+            except UnknownProtocolError:  # a mistake in the file
+                pass
+            changed.setdefault(kind, {})[name] = table
+        recorded = Config(self.tables.model_copy(update=changed), self.path, self.text, self.recorded_with)
+        recorded.not_loaded = not_loaded
+        return recorded
 
     def files_of(self, table: DeviceTable) -> dict[FileKey, Path]:
         """Return the files that a device's table names, by key."""
@@ -306,6 +328,8 @@ class Config:
                 continue
             if package is not None:
                 found[f"{kind}/{table.protocol}"] = package
+        for source, (protocol, error) in self.not_loaded.items():
+            found[f"{source.partition('/')[0]}/{protocol}"] = error.package
         return found
 
     def attachment_names(self) -> list[tuple[str, str]]:

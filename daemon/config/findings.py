@@ -29,6 +29,8 @@ USUAL_BAUDS = (
 def configuration_findings(config: Config) -> list[str]:
     """Return what is hardly meant in a valid configuration, one line each."""
     lines = [] if any(config.device_tables()) or config.pps else [NO_SOURCE]
+    for source, (_, error) in config.not_loaded.items():
+        lines.append(f"{source.replace('/', '.')}.protocol: {error}; meanwhile the device is recorded as it comes")
     return [*lines, *lever_arm_findings(config), *_bauds(config), *_unseen_pps(config), *_untold_angles(config)]
 
 

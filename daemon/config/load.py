@@ -19,8 +19,12 @@ from swath.georef.toml_tables import TomlError, toml_tables
 MAX_CONFIG_BYTES = 4 * 1024 * 1024  # far above any real configuration; a log given by mistake is not read whole
 
 
-def load_config(path: str | Path) -> Config:
+def load_config(path: str | Path, *, to_record: bool = False) -> Config:
     """Read and validate a configuration file and all files that it names.
+
+    Args:
+        path: the file.
+        to_record: allow devices whose driver's package cannot be loaded, and give them the protocol ``raw``.
 
     Raises:
         ConfigError: the configuration is wrong; it has one line for each fault.
@@ -40,11 +44,11 @@ def load_config(path: str | Path) -> Config:
     except UnicodeDecodeError as error:
         line = content[: error.start].count(b"\n") + 1
         raise ConfigError(f"{file}: line {line}: not UTF-8 text; want a TOML file") from error
-    return parse_config(text, file)
+    return parse_config(text, file, to_record=to_record)
 
 
-def parse_config(text: str, path: Path) -> Config:
-    """Validate the text of a configuration whose files lie beside ``path``.
+def parse_config(text: str, path: Path, *, to_record: bool = False) -> Config:
+    """Validate the text of a configuration whose files lie beside ``path``; ``to_record`` as in `load_config`.
 
     Raises:
         ConfigError: the configuration is wrong; it has one line for each fault.
@@ -53,11 +57,11 @@ def parse_config(text: str, path: Path) -> Config:
         table = toml_tables(text)
     except TomlError as error:
         raise ConfigError(f"{path}: {error}") from error
-    return validate(table, path, text)
+    return validate(table, path, text, to_record=to_record)
 
 
-def validate(table: Mapping[str, Any], path: Path, text: str) -> Config:
-    """Validate a parsed configuration; ``text`` is the text that it was parsed from.
+def validate(table: Mapping[str, Any], path: Path, text: str, *, to_record: bool = False) -> Config:
+    """Validate a parsed configuration; ``text`` is the text that it was parsed from, ``to_record`` as in `load_config`.
 
     Raises:
         ConfigError: the configuration is wrong; it has one line for each fault.
@@ -68,6 +72,7 @@ def validate(table: Mapping[str, Any], path: Path, text: str) -> Config:
         lines = [describe(details) for details in error.errors(include_url=False)]
         raise ConfigError([f"{path}: {line}" for line in lines]) from error
     config = Config(tables, path, text)
+    config = config.as_recorded() if to_record else config
     lines = check_devices(config)
     if lines:
         raise ConfigError([f"{path}: {line}" for line in lines])

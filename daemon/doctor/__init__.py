@@ -46,14 +46,19 @@ def examine(config: Config | None, *, write: bool = True) -> Iterator[Finding]:
     yield from _clock(tree)
     yield from _disk(tree, config, write)
     yield from _devices(tree, config, specs)
-    yield from other_drivers()
+    yield from other_drivers(config)
 
 
-def other_drivers() -> Iterator[Finding]:
-    """Report drivers of other packages that cannot be used; a configuration that needs one is refused earlier."""
+def other_drivers(config: Config | None) -> Iterator[Finding]:
+    """Report drivers of other packages that cannot be used: wrong if a configured device needs one."""
+    needed = {} if config is None else {protocol: source for source, (protocol, _) in config.not_loaded.items()}
     for one in not_loaded():
         what = f"protocol {one.protocol}: " if one.protocol else ""
-        yield Finding("drivers", Verdict.NOTE, f"{what}{one}", "swath devices")
+        if one.protocol in needed:
+            text = f"{what}{one}; {needed[one.protocol]} is recorded as it comes"
+            yield Finding("drivers", Verdict.WRONG, text, "swath devices")
+        else:
+            yield Finding("drivers", Verdict.NOTE, f"{what}{one}", "swath devices")
 
 
 def _specs(config: Config | None) -> list[TransportSpec]:

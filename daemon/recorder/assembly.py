@@ -9,7 +9,7 @@ from pathlib import Path
 from swath.daemon.config import Config, DeviceEntry, GnssConfig
 from swath.daemon.log.block_queue import BlockQueue
 from swath.daemon.log.channels import ChannelTable, JsonChannel
-from swath.daemon.log.events import Events
+from swath.daemon.log.events import Events, Severity
 from swath.daemon.log.format import SessionInfo
 from swath.daemon.log.host_clock import HostClock
 from swath.daemon.log.parts import Attachment, Parts
@@ -93,6 +93,8 @@ def assemble(config: Config, queue_bytes: int = QUEUE_BYTES) -> Assembly:
         _add_device(assembly, device, inside)
     for receiver in assembly.receivers:
         recorder.add_source(receiver.source)
+    for source, (_, error) in config.not_loaded.items():
+        events.post(Severity.ERROR, source, "driver_not_loaded", f"{error}; the device is recorded as it comes")
     return assembly
 
 

@@ -133,10 +133,10 @@ class TestFinding:
         assert "example-scanner" in all_drivers("scanner")
         assert run_app(["devices"]) == 0
         assert f"acme: {why}\n" in capsys.readouterr().out
-        assert f"protocol acme: {why}" in [finding.text for finding in other_drivers()]
+        assert f"protocol acme: {why}" in [finding.text for finding in other_drivers(None)]
         text = CONFIG.replace('"example-scanner"', '"acme"')
         needed = f"scanner.left.protocol: scanner protocol 'acme': {why}"
-        assert lines_of(text) == [f'{needed}; protocol = "raw" records the device meanwhile']
+        assert lines_of(text) == [f"{needed}; meanwhile swath run records the device as it comes"]
         assert parse_config(text.replace('"acme"', '"raw"'), Path("a.toml")).scanner["left"].options
 
     def test_a_protocol_belongs_to_one_package(self, site: Site) -> None:
