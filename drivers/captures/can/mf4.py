@@ -7,8 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import datetime as dt
+import gc
 import heapq
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,6 +31,7 @@ from swath.drivers.captures.base import (
 )
 from swath.drivers.captures.can.clock import FileClock, FileTime
 from swath.drivers.transports.base import TransportError
+from swath.georef.arrays import FloatArray
 
 _DATA, _REMOTE, _ERROR = "CAN_DataFrame", "CAN_RemoteFrame", "CAN_ErrorFrame"
 _RECORDS_A_READ = 20_000
@@ -72,12 +75,34 @@ def _opened(path: Path) -> Iterator[Any]:
                         shutil.copyfileobj(stream, copy)
                 except (EOFError, OSError) as error:
                     raise TransportError(f"{path}: cannot be unpacked: {error}") from error
-        try:
-            mdf = MDF(plain)
-        except Exception as error:  # asammdf raises any kind on damaged files
-            raise TransportError(f"{path}: asammdf cannot read it: {_words(error)}") from error
+        mdf, why = _loaded(plain)
+        if mdf is None:
+            raise TransportError(f"{path}: asammdf cannot read it: {why}")
         stack.callback(mdf.close)
         yield mdf
+
+
+def _loaded(path: Path) -> tuple[Any, str]:
+    """Return asammdf's object of a file; None, and the reason, where it has none.
+
+    What asammdf leaves of a file that it cannot read raises again when it is removed. It is removed here, while no such
+    error is printed.
+    """
+    hook, why = sys.unraisablehook, ""
+    sys.unraisablehook = _ignore
+    try:
+        try:
+            return MDF(path), ""
+        except Exception as error:  # asammdf raises any kind on damaged files
+            why = _words(error)
+        gc.collect()
+    finally:
+        sys.unraisablehook = hook
+    return None, why
+
+
+def _ignore(_: object) -> None:
+    """Print nothing about an error that nobody can catch."""
 
 
 def _words(error: Exception) -> str:
@@ -109,15 +134,9 @@ def _group(
     mdf: Any, number: int, name: str, count: int, start_ns: int, path: Path, tally: CaptureTally | None
 ) -> Iterator[CapturedUnit]:
     """Yield the units of one group of records, a part of the records at a time."""
-    for offset in range(0, count, _RECORDS_A_READ):
-        try:
-            signal = mdf.get(name, number, raw=True, record_offset=offset, record_count=_RECORDS_A_READ)
-            rows, stamps = signal.samples, np.asarray(signal.timestamps, np.float64)
-            fields = {one.rpartition(".")[2]: rows[one] for one in rows.dtype.names or ()}
-            ids, lengths = fields["ID"].astype(np.int64), fields["DataLength"].astype(np.int64)
-            data = fields["DataBytes"] if name == _DATA else None
-        except Exception as error:  # asammdf raises any kind on damaged files
-            raise CaptureDamageError(f"{path}: asammdf cannot read its records: {_words(error)}") from error
+    for offset, fields, stamps in _records(mdf, number, name, 0, count, path):
+        ids, lengths = fields["ID"].astype(np.int64), fields["DataLength"].astype(np.int64)
+        data = fields["DataBytes"] if name == _DATA else None
         is_extended = _flags(fields, "IDE", len(ids)) | (ids & CAN_EFF_FLAG != 0)
         is_fd, brs, esi = (_flags(fields, one, len(ids)) for one in ("EDL", "BRS", "ESI"))
         for row in range(len(ids)):
@@ -136,6 +155,35 @@ def _group(
             if 0 <= time_ns <= LATEST_NS:
                 channel = str(int(fields["BusChannel"][row])) if "BusChannel" in fields else "1"
                 yield CapturedUnit(time_ns, frame, channel)
+
+
+def _records(
+    mdf: Any, number: int, name: str, offset: int, count: int, path: Path
+) -> Iterator[tuple[int, dict[str, Any], FloatArray]]:
+    """Yield the records of a group from one on: their first number, fields by name, and times (n,) s.
+
+    A part that cannot be read is halved, so that all records before the first bad one are read.
+
+    Raises:
+        CaptureDamageError: a record cannot be read.
+    """
+    needed = {"ID", "DataLength", "DataBytes"} if name == _DATA else {"ID", "DataLength"}
+    for first in range(offset, offset + count, _RECORDS_A_READ):
+        size = min(_RECORDS_A_READ, offset + count - first)
+        try:
+            signal = mdf.get(name, number, raw=True, record_offset=first, record_count=size)
+            fields = {one.rpartition(".")[2]: signal.samples[one] for one in signal.samples.dtype.names or ()}
+            stamps = np.asarray(signal.timestamps, np.float64)
+            why = "" if needed <= fields.keys() else f"its records have no {', '.join(sorted(needed - fields.keys()))}"
+        except Exception as error:  # asammdf raises any kind on damaged files
+            fields, stamps, why = {}, np.zeros(0), _words(error)
+        if not why:
+            yield first, fields, stamps
+        elif size == 1 or fields:
+            raise CaptureDamageError(f"{path}: asammdf cannot read record {first} of {name}: {why}")
+        else:
+            yield from _records(mdf, number, name, first, size // 2, path)
+            yield from _records(mdf, number, name, first + size // 2, size - size // 2, path)
 
 
 def _flags(fields: dict[str, Any], name: str, count: int) -> Any:

@@ -16,6 +16,19 @@ _RAW = (_RAW_IP, _RAW_IP_BSD, _RAW_IP_OPENBSD, _IPV4_ONLY, _IPV6_ONLY)
 _BARE = {**dict.fromkeys(_RAW, 0), _NULL: 4, _LOOP: 4}  # bytes before the IP packet
 _SOCKETCAN = 227
 CAN_LINKS = (_SOCKETCAN, _LINUX_SLL, _LINUX_SLL2)  # those that may carry frames of a CAN bus
+_OTHER_LINKS = {  # by which a user may capture by mistake
+    9: "PPP",
+    50: "PPP",
+    105: "IEEE 802.11",
+    127: "IEEE 802.11 with radiotap",
+    187: "Bluetooth HCI",
+    189: "USB of Linux",
+    190: "CAN 2.0B, without a layout",
+    201: "Bluetooth HCI",
+    220: "USB of Linux",
+    249: "USBPcap",
+    253: "Linux Netlink",
+}
 _IPV4, _IPV6 = 0x0800, 0x86DD
 _VLAN_TAGS = (0x8100, 0x88A8, 0x9100)
 _ARPHRD_CAN = 280  # linux/if_arp.h
@@ -54,9 +67,10 @@ def ip_packet(link: int, frame: bytes) -> bytes:
     elif link == _LINUX_SLL2:
         kind, at = frame[0:2], 20
     else:
+        name = f" ({_OTHER_LINKS[link]})" if link in _OTHER_LINKS else ""
         raise UnknownLinkError(
-            f"link type {link} is not known; want Ethernet (1), raw IP (101), Linux cooked (113, 276) or SocketCAN "
-            "(227)"
+            f"link type {link}{name} is not known; want Ethernet (1), raw IP (101), Linux cooked (113, 276) or "
+            "SocketCAN (227)"
         )
     while int.from_bytes(kind, "big") in _VLAN_TAGS and at + 4 <= len(frame):  # IEEE 802.1Q: tag, then the next type
         kind, at = frame[at + 2 : at + 4], at + 4

@@ -31,6 +31,8 @@ from tests.daemon.builders import mcap_doctor, run_python
 from tests.daemon.commands import swath
 from tests.daemon.exchange.builders import CONFIG, content_of, run_import, write_config, write_log
 from tests.daemon.log_check import official_counts, read_log
+from tests.drivers.captures.can_logs import BLF_CLASSIC, blf_container, blf_file, blf_object
+from tests.drivers.captures.network import DEVICE, SYN, acknowledging, from_device, write_frames
 
 FIXTURES = ROOT / "fixtures"
 VELODYNE = FIXTURES / "velodyne" / "mrpt_vlp16_gps.pcap.gz"
@@ -536,7 +538,7 @@ def test_an_impossible_row_of_a_sidecar_is_reported(tmp_path: Path, row: str) ->
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["pcap", "candump", "rtklib", "table", "bytes", "sidecar"])
+@pytest.mark.parametrize("kind", ["pcap", "tcp", "candump", "blf", "rtklib", "table", "bytes", "sidecar"])
 def test_truncated_and_damaged_captures_never_break_an_import(tmp_path: Path, kind: str) -> None:
     """Any fault is counted or refused in one line, and the resulting log is whole."""
     config = write_config(tmp_path)
@@ -546,6 +548,14 @@ def test_truncated_and_damaged_captures_never_break_an_import(tmp_path: Path, ki
     told = ImportOptions()
     if kind == "pcap":
         target = write_pcap(folder / "a.pcap", [bytes([n]) * 30 for n in range(5)])
+    elif kind == "tcp":
+        config = write_config(tmp_path, CONFIG.replace("serial:/dev/ttyUSB0?baud=115200", f"tcp:{DEVICE.host}:28784"))
+        target = write_frames(
+            folder / "a.pcap", [from_device(99, b"abc", SYN), from_device(110, b"d"), acknowledging(103)]
+        )
+    elif kind == "blf":
+        target = folder / "a.blf"
+        target.write_bytes(blf_file(blf_container(blf_object(1, BLF_CLASSIC) * 4, 0)))
     elif kind == "candump":
         target = folder / "a.log"
         target.write_text("".join(f"(1.{n:06d}) can1 12{n}#0011\n" for n in range(8)))

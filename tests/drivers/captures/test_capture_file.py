@@ -340,7 +340,8 @@ def test_bad_pcap_files_are_refused_in_one_line(tmp_path: Path) -> None:
         "record": (data[:30], "ends in a record header at byte 24"),
         "packet": (data[:-3], "at byte 86"),
         "length": (data[:32] + b"\xff\xff\xff\xff" + data[36:], "is damaged, at byte 24"),
-        "link": (data[:20] + b"\x93\0\0\0" + data[24:], "link type 147"),
+        "link": (data[:20] + b"\x93\0\0\0" + data[24:], "link type 147 is not known; want Ethernet"),
+        "usb": (data[:20] + b"\xdc\0\0\0" + data[24:], r"link type 220 \(USB of Linux\) is not known; want Ethernet"),
         "gzip": (gzip.compress(data)[:-12], "cannot be read further"),
     }
     for name, (content, text) in cases.items():
