@@ -552,7 +552,7 @@ class LiveConfig(Section):
         100_000, ge=1, le=100_000, description="points written to live.mcap for display; grids use all points"
     )
     cell_m: float = Field(
-        1.0, ge=0.05, le=1000.0, description="cell size of the density grid; doubled when the area is too large"
+        2.0, ge=0.05, le=1000.0, description="cell size of the map; doubled when the area is too large"
     )
 
 

@@ -35,6 +35,7 @@ from swath.daemon.log.format import SessionInfo
 from swath.daemon.processing.compiling import compilations
 from swath.daemon.processing.live.frame import LocalFrame, Maps
 from swath.daemon.processing.live.grid import CellGrid, paint_points
+from swath.daemon.processing.live.painting import LiveMap
 from swath.daemon.processing.live.products import Thinning
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.drivers.driver import find_driver
@@ -217,6 +218,12 @@ def _warm_frame(points: Points, trajectory: Trajectory | None, mapping: Maps | N
         frame = LocalFrame(trajectory.position_e[-1], mapping)
         frame.cloud_of(points, Thinning(1000).keep(points.time_ns))
         frame.pose_of(trajectory.position_e[-1], trajectory.q_e_from_b[-1])
+        frame.placement()
+        made = LiveMap(Path(), 1.0, 0, lambda host_ns: None)
+        made.update(trajectory, 0)
+        made.take(points, frame)
+        made.end()
+        trajectory.between(int(trajectory.time_ns[-1]), int(trajectory.time_ns[-1])).velocity_l()
 
 
 def _warm_products(points: Points) -> None:

@@ -28,8 +28,8 @@ NADIR_RAD = math.radians(10.0)  # farther from the vertical a range is not one t
 BACK_NS = SECOND_NS  # from the newest point to the line of the profile: inclined beams have seen all of it by then
 STALE_NS = 2 * SECOND_NS  # without points: figures of the ground are no longer those of the present place
 HALF_WIDTH_M = 1.0  # of the profile
-PROFILE_POINTS = 4000
-BEFORE_M = 2000.0  # to either side, as far as earlier strips are shown
+PROFILE_POINTS = 1500
+BEFORE_M = 200.0  # beyond the last points, as far as earlier strips are shown
 RECENT_S, RECENT_POINTS = 60, 50_000
 RECENT_HEAD = struct.Struct("<4sHHIIq")  # SWTR, version, bytes of the head and of a row, number of rows, GPS nanosecond
 RECENT_DTYPE = np.dtype(
@@ -73,6 +73,7 @@ class LastLook:
         self._poses: deque[tuple[int, float, float, float]] = deque(maxlen=100)  # GPS time, east, north, up
         self._blocks: deque[_Block] = deque()
         self._recent: deque[_Block] = deque()
+        self._saved = 0
         self._second, self._in_second, self._stride, self._shown, self._until = 0, 0, 1, 0, 0
 
     def take_pose(self, gps_ns: int, position: FloatArray) -> None:
@@ -183,22 +184,19 @@ class LastLook:
             return None
         along = track / length_m
         right = np.array([along[1], -along[0]])
+        off, up_m, time_ns = self._near(at_ns, here, along)
+        numbers = strips_at(time_ns, edges)
         strips: dict[str, dict[str, list[float]]] = {}
-        blocks = list(self._blocks)
-        xyz = np.concatenate([block.xyz for block in blocks]).astype(np.float64)
-        off = xyz[:, :2] - here[:2]
-        near = np.flatnonzero(np.abs(off @ along) <= HALF_WIDTH_M)
-        near = near[:: max(1, -(-len(near) // PROFILE_POINTS))]
-        numbers = strips_at(np.concatenate([block.time_ns for block in blocks])[near], edges)
         for number in np.unique(numbers).tolist():
-            own = near[numbers == number]
-            _put(strips, number, off[own] @ right, xyz[own, 2])
-        across = np.arange(-BEFORE_M, BEFORE_M, HALF_WIDTH_M)
-        up, numbers = earlier(here[:2] + across[:, np.newaxis] * right)
-        for number in np.unique(numbers[np.isfinite(up)]).tolist():
-            own = np.flatnonzero((numbers == number) & np.isfinite(up))
+            own = numbers == number
+            _put(strips, number, off[own] @ right, up_m[own])
+        reach_m = BEFORE_M + float(np.abs(off @ right).max(initial=0.0))
+        across = np.arange(-reach_m, reach_m, 2.0 * HALF_WIDTH_M)
+        up_m, numbers = earlier(here[:2] + across[:, np.newaxis] * right)
+        for number in np.unique(numbers[np.isfinite(up_m)]).tolist():
+            own = (numbers == number) & np.isfinite(up_m)
             if str(number) not in strips:
-                _put(strips, number, across[own], up[own])
+                _put(strips, number, across[own], up_m[own])
         return {
             "gps_ns": at_ns,
             "east_m": round(float(here[0]), 2),
@@ -207,6 +205,21 @@ class LastLook:
             "width_m": 2.0 * HALF_WIDTH_M,
             "strips": strips,
         }
+
+    def _near(self, at_ns: int, here: FloatArray, along: FloatArray) -> tuple[FloatArray, FloatArray, Int64Array]:
+        """Return the points near the line of the profile: east and north of its place (n, 2), up and GPS times."""
+        found = [(np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64))]
+        for block in self._blocks:
+            if int(block.time_ns[0]) > at_ns + BACK_NS or int(block.time_ns[-1]) < at_ns - BACK_NS:
+                continue
+            x, y = along.astype(np.float32).tolist()
+            away_m = block.xyz[:, 0] * np.float32(x) + block.xyz[:, 1] * np.float32(y) - np.float32(here[:2] @ along)
+            near = np.flatnonzero(np.abs(away_m) <= HALF_WIDTH_M)
+            xyz = block.xyz[near].astype(np.float64)
+            found.append((xyz[:, :2] - here[:2], xyz[:, 2], block.time_ns[near]))
+        off, up_m, time_ns = (np.concatenate(column) for column in zip(*found, strict=True))
+        step = max(1, -(-len(off) // PROFILE_POINTS))
+        return off[::step], up_m[::step], time_ns[::step]
 
     def recent(self, edges: Int64Array) -> bytes:
         """Return the last minute's points, few of them, as the file ``recent.bin``: a head and `RECENT_DTYPE`."""
@@ -225,16 +238,19 @@ class LastLook:
             done += len(part)
         return RECENT_HEAD.pack(b"SWTR", 1, RECENT_HEAD.size, rows.itemsize, len(rows), first_ns) + rows.tobytes()
 
-    def save(self, folder: Path, edges: Int64Array, earlier: Earlier) -> None:
-        """Replace profile and recent points.
+    def save(self, folder: Path, edges: Int64Array, earlier: Earlier, *, last: bool = False) -> None:
+        """Replace the profile and the recent points by turns; both if it is the ``last`` time.
 
         Raises:
             OSError: a file cannot be written.
         """
-        profile = self.profile(edges, earlier)
-        if profile is not None:
-            replace_file(folder / PROFILE, (json.dumps(profile, separators=(",", ":")) + "\n").encode())
-        replace_file(folder / RECENT, self.recent(edges))
+        self._saved += 1
+        if self._saved % 2 or last:
+            profile = self.profile(edges, earlier)
+            if profile is not None:
+                replace_file(folder / PROFILE, (json.dumps(profile, separators=(",", ":")) + "\n").encode())
+        if not self._saved % 2 or last:
+            replace_file(folder / RECENT, self.recent(edges))
 
 
 def read_recent(data: bytes) -> tuple[NDArray[Any], int]:

@@ -102,7 +102,7 @@ class LiveMap:
 
     def is_due(self, log_time_ns: int) -> bool:
         """Return whether tiles have changed, and a second of log time has passed since they were written."""
-        return self.grid.has_changed and log_time_ns >= self._saved_ns + SECOND_NS
+        return log_time_ns >= self._saved_ns + SECOND_NS and self.grid.has_changed
 
     def save(self, log_time_ns: int, about: dict[str, Any]) -> None:
         """Write the tiles that have changed, and the index; ``about`` says what the coordinates refer to."""

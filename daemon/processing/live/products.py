@@ -204,7 +204,7 @@ class LiveProducts:
         if self._mcap is not None:
             self._mcap.beside_bytes = self.map.file_bytes
         try:
-            self.look.save(self._folder, self.map.cutter.edges(), self.map.comparison.heights)
+            self.look.save(self._folder, self.map.cutter.edges(), self.map.comparison.heights, last=last)
         except OSError as error:
             self.map.trouble = f"{PROFILE}: {error.strerror or error}: the last moments are not written"
 

@@ -34,7 +34,7 @@ from swath.georef.strips import Span, StripRules, straight_spans
 from swath.georef.timescales.gps_time import SECOND_NS
 from swath.georef.trajectory.trajectory import Trajectory
 
-LOOK_NS = SECOND_NS // 2  # between two looks at the trajectory
+LOOK_NS = SECOND_NS  # between two looks at the trajectory
 STEP_NS = SECOND_NS // 10  # between the attitudes that a turn is found by
 HOLE_NS = 3 * STEP_NS  # between two of them: a gap of the trajectory
 SEEN_NS = 20 * SECOND_NS  # of attitudes that are kept: longer than a strip that is too short, and a turn
@@ -161,12 +161,12 @@ class StripCutter:
 
     def _see(self, trajectory: Trajectory) -> None:
         """Keep the attitudes of new epochs, about ten a second."""
-        first = int(np.searchsorted(trajectory.time_ns, self._newest_ns + STEP_NS))
-        new = trajectory.time_ns[first:]
-        _, chosen = np.unique((new - new[:1]) // STEP_NS, return_index=True)
-        if not len(chosen):
+        time_ns = trajectory.time_ns
+        first = int(np.searchsorted(time_ns, self._newest_ns + STEP_NS))
+        if first == len(time_ns):
             return
-        rows = first + chosen
+        span_ns = max(1, int(time_ns[-1] - time_ns[first]))
+        rows = np.arange(first, len(time_ns), max(1, (len(time_ns) - 1 - first) * STEP_NS // span_ns))
         picked = Trajectory(
             trajectory.time_ns[rows],
             trajectory.position_e[rows],

@@ -87,8 +87,8 @@ def test_strips_in_flight_are_those_of_the_office() -> None:
     assert dropped == [2], "the number of the short stretch is given again"
     for strip, (start, end) in zip(cutter.strips, office, strict=True):
         assert abs(strip.start_ns - start) < 0.15 * SECOND_NS
-        # the trajectory is looked at twice a second: the last strip ends at the last look
-        assert abs(strip.end_ns - end) < (0.15 if strip.number < 4 else 0.5) * SECOND_NS
+        # the trajectory is looked at once a second: the last strip ends at the last look
+        assert abs(strip.end_ns - end) < (0.15 if strip.number < 4 else 1.0) * SECOND_NS
     truth = np.zeros(len(trajectory), np.int64)
     for number, (start, end) in enumerate(office, start=1):
         truth[(trajectory.time_ns >= start) & (trajectory.time_ns < end)] = number
