@@ -44,6 +44,7 @@ IMPORTED_LATE = {
         "swath.daemon.processing.pages",
     },
     "swath.daemon.processing.flights.trajectory_choice": {"swath.georef.trajectory.turn_rates"},  # scipy.signal
+    "swath.daemon.processing.live.coverage": {"rasterio"},
     "swath.daemon.processing.pages.pdf": {"weasyprint"},
     "swath.daemon.processing.records.files": {"pyarrow", "swath.daemon.processing.records.mcap"},  # and protobuf
     "swath.daemon.processing.setup.terrain": {"rasterio"},

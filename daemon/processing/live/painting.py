@@ -26,7 +26,7 @@ HERE, METRES = np.zeros(3), np.ones(3)  # origin and units of points that are in
 IMAGE_CELLS = 2048
 COVERAGE, PICTURE = "coverage.json", "coverage.png"
 # Points per square metre, and the colour from there on; empty cells are transparent.
-_COLOURS = ((0.0, 0x5A0F1E), (1.0, 0xB0282E), (2.0, 0xE8743B), (4.0, 0xF4C95D), (8.0, 0x86B66B), (16.0, 0x2F8C74),
+COLOURS = ((0.0, 0x5A0F1E), (1.0, 0xB0282E), (2.0, 0xE8743B), (4.0, 0xF4C95D), (8.0, 0x86B66B), (16.0, 0x2F8C74),
             (32.0, 0x1F5F8B))  # fmt: skip
 
 
@@ -149,7 +149,7 @@ class LiveMap:
             "cell_m": cell_m,
             "rows": counts.shape[0],
             "columns": counts.shape[1],
-            "colours_from_points_per_m2": {f"#{colour:06x}": density for density, colour in _COLOURS},
+            "colours_from_points_per_m2": {f"#{colour:06x}": density for density, colour in COLOURS},
         }
         replace_file(self._folder / PICTURE, picture(counts, cell_m))
         replace_file(self._folder / COVERAGE, (json.dumps(numbers, indent=2) + "\n").encode())
@@ -160,12 +160,12 @@ def picture(counts: NDArray[Any], cell_m: float) -> bytes:
     empty ones are clear.
     """
     index: ByteArray = np.zeros(counts.shape, dtype=np.uint8)
-    for density, _ in _COLOURS:
+    for density, _ in COLOURS:
         index += counts >= max(1, math.ceil(density * cell_m**2))
     rows, columns = index.shape
     lines = np.zeros((rows, columns + 1), dtype=np.uint8)  # each line begins with the number of its filter: 0
     lines[:, 1:] = index
-    palette = b"".join(colour.to_bytes(3, "big") for colour in (0, *(colour for _, colour in _COLOURS)))
+    palette = b"".join(colour.to_bytes(3, "big") for colour in (0, *(colour for _, colour in COLOURS)))
     head = struct.pack(">IIBBBBB", columns, rows, 8, 3, 0, 0, 0)
     pieces = {b"IHDR": head, b"PLTE": palette, b"tRNS": b"\0", b"IDAT": zlib.compress(lines.tobytes(), 1), b"IEND": b""}
     return b"\x89PNG\r\n\x1a\n" + b"".join(

@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 
 from swath.daemon.config.tables import LiveConfig
+from swath.daemon.errors import one_line
+from swath.daemon.processing.live.coverage import write_coverage
 from swath.daemon.processing.live.frame import LocalFrame, Maps
 from swath.daemon.processing.live.look import PROFILE, LastLook
 from swath.daemon.processing.live.mcap import NAME, LiveMcap, LivePose
@@ -292,6 +294,15 @@ class LiveProducts:
             self.map.save_coverage(self.origin() | latest)
         except OSError as error:
             self.trouble = f"{COVERAGE}: {error.strerror or error}: nothing is written any more"
+
+    def export_coverage(self) -> list[str]:
+        """Write the map as GeoTIFF and KMZ; return why one is missing, if one is."""
+        if not self._has_space:
+            return [self.trouble]
+        try:
+            return write_coverage(self._folder)
+        except (OSError, ValueError) as error:
+            return [f"the coverage is not written: {one_line(str(error))}"]
 
     def close(self) -> None:
         """Finish and close live.mcap."""

@@ -306,6 +306,7 @@ class Live:
         if self._session is not None:
             self._session.close(live=True)
             self._session.products.save_coverage(self._about())
+            self._session.products.export_coverage()
         return self._say(f"ended ({self._follower.ended or 'stopped'})")
 
 
@@ -363,6 +364,7 @@ def replay(
         run.close(live=False)
         about = {"session_id": session.session_id, "part": session.parts[-1].number}
         run.products.save_coverage(about)
+        run.products.export_coverage()
         found: Told = {"state": "replayed", **about, "time_ns": run.now_ns, "verdict": run.verdict}
         found |= run.status.plain(None, run.now_ns) | run.lines.plain_status()
         found["damaged_chunks"] = len(session.damage)
