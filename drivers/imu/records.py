@@ -98,9 +98,7 @@ class RecordsParser(FramedParser):
         gps_ns = gps_times(rows["time_ns"], scale)
         self._after_table |= scale is Scale.UTC and bool((gps_ns > _LEAPS_KNOWN_NS).any())
         if self._inertial and len(rows) and kind is RowKind.SAMPLE:
-            samples = _samples(rows, host_ns, gps_ns, scale)
-            samples.rows["specific_force_b"] *= self._unit
-            yield samples
+            yield _samples(rows, host_ns, gps_ns, scale, self._unit)
         elif self._inertial and len(rows) and kind is RowKind.SOLUTION:
             good = rows["valid"] != 0
             if not good.all():
@@ -232,7 +230,8 @@ _READERS: dict[RowKind, Callable[[int, TimeTag, Any], Record]] = {
 }
 
 
-def _samples(rows: StructArray, host_ns: Int64Array, gps_ns: Int64Array, scale: Scale) -> ImuSamples:
+@np.errstate(invalid="ignore")  # a signalling NaN on the wire is a NaN like any other
+def _samples(rows: StructArray, host_ns: Int64Array, gps_ns: Int64Array, scale: Scale, unit: float) -> ImuSamples:
     """Return inertial samples: with GPS time of week, or a counter; an unknown sigma of the time counts as 1 s."""
     found = np.zeros(len(rows), IMU_DTYPE)
     found["host_time_ns"] = host_ns
@@ -245,9 +244,11 @@ def _samples(rows: StructArray, host_ns: Int64Array, gps_ns: Int64Array, scale: 
     found["time_sigma_s"] = np.where(known, np.where(sigma_s >= 0.0, sigma_s, UNKNOWN_SIGMA_S), 0.0)
     for name in ("specific_force_b", "angular_rate_b", "temperature_c", "status"):
         found[name] = rows[name]
+    found["specific_force_b"] *= unit
     return ImuSamples(found)
 
 
+@np.errstate(invalid="ignore")
 def _solutions(rows: StructArray, host_ns: Int64Array, gps_ns: Int64Array) -> InsSolution:
     found = np.zeros(len(rows), INS_DTYPE)
     for name in INS_DTYPE.names or ():

@@ -114,6 +114,7 @@ class ReturnsParser(PacketParser):
         tag = TimeTag(TimeScale.GPS, tow_ns, week)
         return [TimeMessage(arrival_ns, tag, NamesEdge.PREVIOUS, message="returns")]
 
+    @np.errstate(invalid="ignore", over="ignore")  # a signalling NaN on the wire is a NaN like any other
     def _returns(self, host_ns: int, device_ns: Int64Array, rows: StructArray, kind: RowKind) -> list[Record]:
         found = np.zeros(len(rows), AIMED_RETURN_DTYPE)
         for name in set(AIMED_RETURN_DTYPE.names or ()) & set(rows.dtype.names or ()):
@@ -121,10 +122,9 @@ class ReturnsParser(PacketParser):
         found["host_time_ns"], found["device_time_ns"] = host_ns, device_ns
         if kind is RowKind.POINT:
             x, y, z = (rows[name].astype(np.float64) for name in ("x_m", "y_m", "z_m"))
-            with np.errstate(invalid="ignore", over="ignore"):
-                flat2 = x * x + y * y
-                found["range_m"] = np.sqrt(flat2 + z * z)
-                found["encoder_rad"], found["elevation_rad"] = np.arctan2(y, x), np.arctan2(z, np.sqrt(flat2))
+            flat2 = x * x + y * y
+            found["range_m"] = np.sqrt(flat2 + z * z)
+            found["encoder_rad"], found["elevation_rad"] = np.arctan2(y, x), np.arctan2(z, np.sqrt(flat2))
             found["pulse_id"] = self._points + np.arange(len(rows))
             self._points += len(rows)
         good = np.isfinite(found["range_m"]) & (found["range_m"] > 0.0)
