@@ -11,8 +11,8 @@ import pkgutil
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import cache
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from functools import cache, partial
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 from swath.drivers import plugins
 from swath.drivers.guard import guarded, guarded_call
@@ -48,6 +48,7 @@ FOLDERS: dict[DeviceKind, tuple[str, ...]] = {  # where drivers of a kind are de
     "corrections": ("corrections",),
     "raw": (),
 }
+ParserT = TypeVar("ParserT", bound=Parser)
 RAW = "raw"  # the protocol of a device that no driver reads; any kind may have it
 
 
@@ -341,6 +342,11 @@ def raw_driver(kind: DeviceKind) -> Driver:
         summary="any device, recorded as it comes and counted; no driver reads it",
         make_parser=RawParser,
     )
+
+
+def times_only(parser: Callable[..., ParserT]) -> Callable[[DeviceSettings], ParserT]:
+    """Return what makes the recorder's parser: a ``parser`` that is asked for time messages only."""
+    return partial(parser, wanted=(TimeMessage,))
 
 
 def receiver_inside(unit: Driver, make_parser: Callable[[DeviceSettings], Parser] | None = None) -> Driver:

@@ -23,7 +23,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from swath.drivers.driver import STREAM_TRANSPORTS, Driver
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver, times_only
 from swath.drivers.framing.checksums import crc32_novatel
 from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import NMEA, NOVATEL_ASCII, RTCM3, UNICORE, UNICORE_HEADER_BYTES
@@ -331,10 +331,7 @@ def _command(line: str, *, baud: int | None = None, last: bool = False) -> Start
     return StartupMessage((line,), data, lambda: PhraseListener(ACCEPTED, REFUSED), baud=baud, last=last)
 
 
-def make_time_parser(settings: DeviceSettings) -> UnicoreParser:
-    """Make the recorder's parser, which returns time messages only."""
-    return UnicoreParser(settings, wanted=(TimeMessage,))
-
+make_time_parser = times_only(UnicoreParser)
 
 DRIVERS = (
     Driver(

@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from math import isfinite, nan
 from typing import TypeAlias
 
-from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside, times_only
 from swath.drivers.framing.framer import Frame, FrameKind
 from swath.drivers.framing.parser import FramedParser
 from swath.drivers.imu.unit_time import WEEK_NS, Moment, UnitTime
@@ -323,10 +323,7 @@ class NcomParser(FramedParser):
         return [DeviceStatus(host_time_ns, values, message="channel 0")]
 
 
-def make_time_parser(settings: DeviceSettings) -> NcomParser:
-    """Make the recorder's parser, which returns time messages only."""
-    return NcomParser(settings, wanted=(TimeMessage,))
-
+make_time_parser = times_only(NcomParser)
 
 UNIT = Driver(
     protocol="oxts-ncom",

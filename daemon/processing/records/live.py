@@ -21,25 +21,22 @@ from swath.daemon.log.format import LogError, SessionInfo, source_of_topic
 from swath.daemon.log.host_messages import feed_clocks
 from swath.daemon.log.mcap.chunks import LogBatch, json_objects
 from swath.daemon.log.parsers import stored_config
-from swath.daemon.processing.navigation.observations import gps_times
 from swath.daemon.processing.navigation.times import GrowingCounter
 from swath.daemon.processing.points.runs import Run
-from swath.daemon.processing.records.tables import GUESSED_LEAP_S, NO_TIME_NS
+from swath.daemon.processing.records.times import arrival_times, clock_times, named_times, own_times
 from swath.daemon.processing.setup.sources import Sources
 from swath.drivers.listening import Measured, Overflow
 from swath.drivers.parser import DeviceKind
-from swath.georef.arrays import FloatArray, Int64Array, StructArray
+from swath.georef.arrays import StructArray
 from swath.georef.records import (
     ChunkBatch,
     DeviceClockSamples,
-    EventMark,
     ImuSamples,
     InsSolution,
     PpsEdge,
     Record,
     ScannerReturns,
     TimeMessage,
-    TimeScale,
 )
 from swath.georef.stream.clocks import DevicePlan, StreamClocks
 from swath.georef.timescales import SECOND_NS, WEEK_NS
@@ -98,8 +95,9 @@ class LiveClocks:
             self._clocks.update()
             times = [self._rows_times(source, rows) if rows is not None else None for rows in counted]
             single = [record for record, found in zip(records, times, strict=True) if found is None]
-            others = iter(self._event_times(source, single))
-        return [next(others) if found is None else found for found in times]
+            others = self._event_times(source, single)
+            found = [next(others) if one is None else one for one in times]
+        return found
 
     def state(self, source: str, host_ns: int) -> tuple[str, float] | None:
         """Return a clock's state and sigma, s, by its source; None: the source is no clock."""
@@ -125,57 +123,25 @@ class LiveClocks:
         """Return the times of a record with rows."""
         rows = record.rows
         if isinstance(record, InsSolution):
-            known = rows["gps_ns"] >= 0
-            return _times(np.where(known, rows["gps_ns"], NO_TIME_NS), np.where(known, 0.0, math.nan))
+            return own_times(rows["gps_ns"], rows["gps_ns"] >= 0)
         if isinstance(record, ImuSamples) and (rows["gps_week"] >= 0).any():
-            known = rows["gps_week"] >= 0
             own_ns = rows["gps_week"].astype(np.int64) * WEEK_NS + rows["device_time_ns"]
-            return _times(np.where(known, own_ns, NO_TIME_NS), np.where(known, rows["time_sigma_s"], math.nan))
+            return own_times(own_ns, rows["gps_week"] >= 0)
         if isinstance(record, DeviceClockSamples) or source not in self._host.plan.devices:
-            return self._arrivals(source, rows["host_time_ns"])
+            return arrival_times(self._host, source, rows["host_time_ns"], self._first)
         gps_ns, sigma_ns = self._clocks.gps_from_device(source, rows["device_time_ns"], rows["host_time_ns"])
-        return _by_clock(gps_ns, np.where(rows["device_time_ns"] >= 0, sigma_ns, math.inf))
+        return clock_times(gps_ns, np.where(rows["device_time_ns"] >= 0, sigma_ns, math.inf))
 
-    def _arrivals(self, source: str, host_ns: Int64Array) -> Times:
-        clock = source if source in self._host.by_source else self._first
-        if clock is None:
-            return _times(np.full(len(host_ns), NO_TIME_NS), np.full(len(host_ns), math.nan))
-        return _by_clock(*self._host.gps_from_host(clock, host_ns))
-
-    def _event_times(self, source: str, records: Sequence[Any]) -> list[Times]:
-        """Return the times of records without rows: those that they name, else those of their arrival."""
-        if not records:
-            return []
+    def _event_times(self, source: str, records: Sequence[Any]) -> Iterator[Times]:
+        """Yield the times of records without rows: those that they name, else those of their arrival."""
+        naming = [hasattr(record, "time") for record in records]
+        named = named_times(self._host, source, [record for record in records if hasattr(record, "time")])
         arrived = np.array([record.host_time_ns for record in records], np.int64)
-        by_arrival = self._arrivals(source, arrived)
-        tags = [getattr(record, "time", None) for record in records]
-        clock = source if source in self._host.by_source else None
-        named = gps_times(self._host, clock, arrived.tolist(), tags)
-        found: list[Times] = []
-        for at, (record, tag, gps_ns) in enumerate(zip(records, tags, named, strict=True)):
-            if tag is None and not hasattr(record, "time"):
-                found.append(Times(by_arrival.gps_ns[at : at + 1], by_arrival.sigma_s[at : at + 1]))
-                continue
-            sigma_s = math.nan if gps_ns is None else self._named_sigma_s(source, record)
-            found.append(_times(np.array([NO_TIME_NS if gps_ns is None else gps_ns]), np.array([sigma_s])))
-        return found
-
-    def _named_sigma_s(self, source: str, record: Any) -> float:
-        """Return the sigma of a time that a record names: 0, the receiver's own, or 1 s if leap seconds are a guess."""
-        own = record.sigma_s if isinstance(record, EventMark) and record.sigma_s is not None else 0.0
-        if record.time.scale is TimeScale.UTC and source in self._host.by_source:
-            return max(own, GUESSED_LEAP_S) if self._host.status(source, record.host_time_ns).leap_doubt else own
-        return float(own)
-
-
-def _times(gps_ns: Any, sigma_s: Any) -> Times:
-    return Times(np.asarray(gps_ns, np.int64), np.asarray(sigma_s, np.float64))
-
-
-def _by_clock(gps_ns: Int64Array, sigma_ns: FloatArray) -> Times:
-    """Return times of a clock that is not known everywhere."""
-    known = np.isfinite(sigma_ns)
-    return _times(np.where(known, gps_ns, NO_TIME_NS), np.where(known, sigma_ns / SECOND_NS, math.nan))
+        by_arrival = arrival_times(self._host, source, arrived, self._first)
+        places = iter(range(len(named.gps_ns)))
+        for at, names in enumerate(naming):
+            times, place = (named, next(places)) if names else (by_arrival, at)
+            yield Times(times.gps_ns[place : place + 1], times.sigma_s[place : place + 1])
 
 
 def live_clocks(config: Config, info: SessionInfo) -> LiveClocks:

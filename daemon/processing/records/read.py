@@ -22,12 +22,12 @@ from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch, json_objects
 from swath.daemon.log.reader import PartDamage, Session
 from swath.daemon.processing.head_clocks import find_stamps
-from swath.daemon.processing.navigation.observations import gps_times
 from swath.daemon.processing.navigation.sources import config_of_log, files_of
 from swath.daemon.processing.navigation.times import imu_times
 from swath.daemon.processing.points.clocks import read_clocks
 from swath.daemon.processing.points.runs import Run
-from swath.daemon.processing.records.tables import GUESSED_LEAP_S, KINDS, NO_TIME_NS, RecordKind, timed_rows
+from swath.daemon.processing.records.tables import KINDS, NO_TIME_NS, RecordKind, timed_rows
+from swath.daemon.processing.records.times import arrival_times, clock_times, named_times
 from swath.daemon.processing.setup.models import geometry_of
 from swath.daemon.processing.setup.sources import Sources
 from swath.drivers.parser import DeviceKind, Parser, ParserCounters
@@ -39,7 +39,6 @@ from swath.georef.records import (
     InsSolution,
     Record,
     ScannerReturns,
-    TimeScale,
 )
 from swath.georef.scanner.beams import Geometry
 from swath.georef.stream.clocks import FrozenClocks, HostClocks, StreamClocks
@@ -287,18 +286,11 @@ class LogRecords:
         if kind.record is InsSolution:
             table["time_sigma_s"][table["gps_ns"] >= 0] = 0.0
             return table
-        if kind.tag is None:
-            self._by_arrival(source, table)
-            return table
-        clock = source if source in self._host.by_source else None
-        tags = [kind.tag(record) for record in records]
-        times = gps_times(self._host, clock, table["host_time_ns"].tolist(), tags)
-        known = np.array([time is not None for time in times], np.bool_)
-        table["gps_ns"] = [NO_TIME_NS if time is None else time for time in times]
-        table["time_sigma_s"][known & np.isnan(table["time_sigma_s"])] = 0.0
-        if clock is not None and len(table) and self._host.status(clock, int(table["host_time_ns"][-1])).leap_doubt:
-            utc = np.array([tag is not None and tag.scale is TimeScale.UTC for tag in tags], np.bool_)
-            table["time_sigma_s"][utc & known] = np.fmax(table["time_sigma_s"][utc & known], GUESSED_LEAP_S)
+        if kind.names_time:
+            times = named_times(self._host, source, records)
+        else:
+            times = arrival_times(self._host, source, table["host_time_ns"], self._clock())
+        table["gps_ns"], table["time_sigma_s"] = times
         return table
 
     def _samples(self, source: str, records: list[ImuSamples]) -> StructArray:
@@ -313,15 +305,6 @@ class LogRecords:
 
     def _imu(self, source: str) -> ImuConfig:
         return self.config.imu[source.removeprefix("imu/")]
-
-    def _by_arrival(self, source: str, table: StructArray) -> None:
-        """Give a table the times at which its records arrived."""
-        clock = source if source in self._host.by_source else self._clock()
-        if clock is None:
-            return
-        gps_ns, sigma_ns = self._host.gps_from_host(clock, table["host_time_ns"])
-        known = np.isfinite(sigma_ns)
-        table["gps_ns"][known], table["time_sigma_s"][known] = gps_ns[known], sigma_ns[known] / SECOND_NS
 
     def returns(self, source: str, start_ns: int | None = None, stop_ns: int | None = None) -> Iterator[StructArray]:
         """Yield tables of a scanner's returns in a span of GPS time, in order of arrival; memory is bounded.
@@ -365,8 +348,8 @@ class _Waiting:
     def _timed(self, rows: StructArray) -> StructArray:
         self._clocks.update()
         gps_ns, sigma_ns = self._clocks.gps_from_device(self._source, rows["device_time_ns"], rows["host_time_ns"])
-        table, known = timed_rows(rows), np.isfinite(sigma_ns)
-        table["gps_ns"][known], table["time_sigma_s"][known] = gps_ns[known], sigma_ns[known] / SECOND_NS
+        table = timed_rows(rows)
+        table["gps_ns"], table["time_sigma_s"] = clock_times(gps_ns, sigma_ns)
         return table
 
 

@@ -29,7 +29,6 @@ from swath.georef.records import (
     Record,
     ScannerReturns,
     TimeMessage,
-    TimeTag,
 )
 
 NO_TIME_NS = -1
@@ -183,14 +182,14 @@ class RecordKind:
         record: the type that parsers give.
         dtype: row type of an empty table.
         rows: makes a table of records; None: the record is rows, see `timed_rows`.
-        tag: returns the time that a record names itself; None: it names none.
+        names_time: True if a record names its time itself, as ``time``.
     """
 
     name: str
     record: type
     dtype: np.dtype[Any]
     rows: Callable[[Sequence[Any]], StructArray] | None = None
-    tag: Callable[[Any], TimeTag | None] | None = None
+    names_time: bool = False
 
     def table(self, records: Sequence[Any]) -> StructArray:
         """Return a table of records, without times."""
@@ -201,17 +200,13 @@ class RecordKind:
         return timed_rows(np.concatenate([record.rows for record in records]))
 
 
-def _own_time(record: GnssFix | GnssHeading | EventMark | TimeMessage) -> TimeTag | None:
-    return record.time
-
-
 KINDS = {
     kind.name: kind
     for kind in (
-        RecordKind("fixes", GnssFix, FIX_TABLE, fix_rows, _own_time),
-        RecordKind("headings", GnssHeading, HEADING_TABLE, heading_rows, _own_time),
-        RecordKind("marks", EventMark, MARK_TABLE, mark_rows, _own_time),
-        RecordKind("times", TimeMessage, TIME_TABLE, time_rows, _own_time),
+        RecordKind("fixes", GnssFix, FIX_TABLE, fix_rows, names_time=True),
+        RecordKind("headings", GnssHeading, HEADING_TABLE, heading_rows, names_time=True),
+        RecordKind("marks", EventMark, MARK_TABLE, mark_rows, names_time=True),
+        RecordKind("times", TimeMessage, TIME_TABLE, time_rows, names_time=True),
         RecordKind("status", DeviceStatus, STATUS_TABLE, status_rows),
         RecordKind("samples", ImuSamples, SAMPLE_TABLE),
         RecordKind("solutions", InsSolution, SOLUTION_TABLE),

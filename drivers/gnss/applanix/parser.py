@@ -29,7 +29,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from swath.drivers.driver import STREAM_TRANSPORTS, Driver
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver, times_only
 from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import GENOUT, NMEA, POS, pos_name
 from swath.drivers.framing.parser import FramedParser
@@ -463,7 +463,7 @@ DRIVERS = (
         yields=(TimeMessage, GnssFix, InsSolution, DeviceStatus),
         summary="Trimble GSOF reports, with the INS of an Applanix receiver (records 1 2 8 12 16 38 41 49 50 70)",
         make_parser=GsofParser,
-        make_time_parser=lambda settings: GsofParser(settings, wanted=(TimeMessage,)),
+        make_time_parser=times_only(GsofParser),
         names_edge=NamesEdge.PREVIOUS,
     ),
     Driver(
@@ -473,7 +473,7 @@ DRIVERS = (
         yields=(TimeMessage, InsSolution, EventMark, DeviceStatus),
         summary="Applanix POS groups (1 to 7, 10, 102 to 105): INS, PPS and events of a POS AV, LV or MV",
         make_parser=PosParser,
-        make_time_parser=lambda settings: PosParser(settings, wanted=(TimeMessage,)),
+        make_time_parser=times_only(PosParser),
         names_edge=NamesEdge.PREVIOUS,
     ),
 )

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from swath.drivers.driver import STREAM_TRANSPORTS, Driver
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver, times_only
 from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import NMEA, NOVATEL, NOVATEL_ASCII, NOVATEL_SHORT, RTCM3
 from swath.drivers.framing.parser import FramedParser
@@ -213,10 +213,7 @@ def imu_scale(settings: DeviceSettings) -> tables.ImuScale | None:
     return tables.IMU_SCALES[number]
 
 
-def make_time_parser(settings: DeviceSettings) -> NovatelParser:
-    """Make the recorder's parser, which returns time messages only."""
-    return NovatelParser(settings, wanted=(TimeMessage,))
-
+make_time_parser = times_only(NovatelParser)
 
 DRIVERS = (
     Driver(

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import TypeAlias
 
-from swath.drivers.driver import STREAM_TRANSPORTS, Driver
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver, times_only
 from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import NMEA, RTCM3, SBF
 from swath.drivers.framing.parser import FramedParser
@@ -304,10 +304,7 @@ def _leap_of_fields(block: sbf.ReceiverTime, stamp: Stamp) -> int | None:
     return None if stamp.tow_ms is None else leap_seconds_of(date, of_day_ms, stamp.tow_ms)
 
 
-def make_time_parser(settings: DeviceSettings) -> SbfParser:
-    """Make the recorder's parser, which returns time messages only."""
-    return SbfParser(settings, wanted=(TimeMessage,))
-
+make_time_parser = times_only(SbfParser)
 
 DRIVERS = (
     Driver(

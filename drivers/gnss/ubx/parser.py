@@ -30,7 +30,7 @@ import math
 from collections.abc import Callable
 from typing import Any, Protocol, TypeAlias, TypeVar
 
-from swath.drivers.driver import STREAM_TRANSPORTS, Driver
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver, times_only
 from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import GNSS_KINDS
 from swath.drivers.framing.parser import FramedParser
@@ -480,7 +480,7 @@ DRIVERS = (
         yields=(TimeMessage, GnssFix, GnssHeading, EventMark, InsSolution, ImuSamples, DeviceStatus),
         summary="u-blox binary (NAV-PVT, older NAV, TIM-TP TM2, NAV-ATT, ESF), NMEA and RTCM3 beside it",
         make_parser=UbxParser,
-        make_time_parser=lambda settings: UbxParser(settings, wanted=(TimeMessage,)),
+        make_time_parser=times_only(UbxParser),
         startup=startup_messages,
     ),
 )

@@ -20,7 +20,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside, times_only
 from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import NMEA
 from swath.drivers.framing.parser import FramedParser
@@ -278,10 +278,7 @@ def gnss_fix(host_time_ns: int, receiver: str, moment: Moment, values: Values) -
     )
 
 
-def make_time_parser(settings: DeviceSettings) -> MicrostrainParser:
-    """Make the recorder's parser, which returns time messages only."""
-    return MicrostrainParser(settings, wanted=(TimeMessage,))
-
+make_time_parser = times_only(MicrostrainParser)
 
 UNIT = Driver(
     protocol="microstrain",

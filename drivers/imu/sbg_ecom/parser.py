@@ -21,7 +21,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside, times_only
 from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import NMEA
 from swath.drivers.framing.parser import FramedParser
@@ -424,10 +424,7 @@ def gnss_fix(receiver: int, moment: Moment, part: FixPart, motion: FixPart | Non
     return fix
 
 
-def make_time_parser(settings: DeviceSettings) -> SbgEcomParser:
-    """Make the recorder's parser, which returns time messages only."""
-    return SbgEcomParser(settings, wanted=(TimeMessage,))
-
+make_time_parser = times_only(SbgEcomParser)
 
 UNIT = Driver(
     protocol="sbg-ecom",

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside
+from swath.drivers.driver import STREAM_TRANSPORTS, Driver, receiver_inside, times_only
 from swath.drivers.framing.framer import Frame
 from swath.drivers.framing.kinds import XBUS, XBUS_EXTENDED, XBUS_MTDATA2
 from swath.drivers.framing.parser import FramedParser
@@ -265,10 +265,7 @@ def _rounded(moment: Moment | None) -> Moment | None:
     return Moment(week, tow_ns, moment.valid)
 
 
-def make_time_parser(settings: DeviceSettings) -> XbusParser:
-    """Make the recorder's parser, which returns time messages only."""
-    return XbusParser(settings, wanted=(TimeMessage,))
-
+make_time_parser = times_only(XbusParser)
 
 UNIT = Driver(
     protocol="xsens-xbus",
