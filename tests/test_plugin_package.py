@@ -48,6 +48,15 @@ log = swath.open("logs")
 tables = list(log["scanner/left"].returns())
 print(len(log["gnss/rover"].fixes()), sum(map(len, tables)), max(table["time_sigma_s"].max() for table in tables))
 """
+READ_OTHERS = """
+import swath
+log = swath.open("logs")
+assert any(True for _ in log["scanner/left"].units())
+try:
+    list(log["scanner/left"].returns())
+except swath.SwathError as error:
+    print(len(log["gnss/rover"].fixes()), error)
+"""
 
 
 def gps_ns() -> int:
@@ -264,6 +273,15 @@ def test_its_devices_are_checked_recorded_and_georeferenced_until_it_is_removed(
     assert np.abs(np.asarray(points.z) - GROUND_M).max() < 0.008
     across_m = np.ptp(np.asarray(points.x))
     assert across_m == pytest.approx(500.0 * (np.tan(np.radians(20.0)) + np.tan(np.radians(19.5))), rel=1e-3)
+
+    (office.place.packages / "swath_example/scanner.py").write_text("import nowhere\n")
+    why = "scanner protocol 'example-scanner': package swath-example 1.0 is not loaded: ModuleNotFoundError"
+    assert f"scanner.left.protocol: {why}" in office.swath("check", "--offline", str(config), status=1)
+    told = office.swath("export", "logs", "tables", "--records", "csv")
+    assert "gnss-rover_fixes.csv" in told
+    assert f"note: scanner/left: {why}" in told
+    told = office.python("-c", READ_OTHERS).stdout
+    assert told.startswith(f"{fixes} scanner.left.protocol: {why}")
 
     office.place.pip("uninstall", "-q", "-y", "swath-example")
     told = office.swath("info", "logs")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -83,7 +83,7 @@ class Config:
         self.path = path
         self.text = text
         self.recorded_with = dict(recorded_with or {})
-        self.not_loaded: dict[str, tuple[str, NotLoadedError]] = {}
+        self.not_loaded: dict[str, tuple[str, UnknownProtocolError]] = {}
 
     @property
     def session(self) -> SessionConfig:
@@ -201,20 +201,29 @@ class Config:
 
         The recorder needs no driver: their bytes are kept, and read when the package works again.
         """
-        changed: dict[str, dict[str, DeviceTable]] = {}
-        not_loaded = {}
+        lacking = self.without_driver()
+        not_loaded = {source: found for source, found in lacking.items() if isinstance(found[1], NotLoadedError)}
+        recorded = self.with_raw(not_loaded)
+        recorded.not_loaded = not_loaded
+        return recorded
+
+    def without_driver(self) -> dict[str, tuple[str, UnknownProtocolError]]:
+        """Return the protocols of devices that have no driver here, and why, by ``kind/name``."""
+        found = {}
         for kind, name, table in self.device_tables():
             try:
                 self.driver_of(kind, table)
-            except NotLoadedError as error:
-                not_loaded[f"{kind}/{name}"] = table.protocol, error
-                table = table.model_copy(update={"protocol": RAW})
-            except UnknownProtocolError:  # a mistake in the file
-                pass
-            changed.setdefault(kind, {})[name] = table
-        recorded = Config(self.tables.model_copy(update=changed), self.path, self.text, self.recorded_with)
-        recorded.not_loaded = not_loaded
-        return recorded
+            except UnknownProtocolError as error:
+                found[f"{kind}/{name}"] = table.protocol, error
+        return found
+
+    def with_raw(self, sources: Collection[str]) -> Config:
+        """Return the configuration in which the devices of these sources have the protocol ``raw``."""
+        changed: dict[str, dict[str, DeviceTable]] = {}
+        for kind, name, table in self.device_tables():
+            raw = f"{kind}/{name}" in sources
+            changed.setdefault(kind, {})[name] = table.model_copy(update={"protocol": RAW}) if raw else table
+        return Config(self.tables.model_copy(update=changed), self.path, self.text, self.recorded_with)
 
     def files_of(self, table: DeviceTable) -> dict[FileKey, Path]:
         """Return the files that a device's table names, by key."""
@@ -329,7 +338,8 @@ class Config:
             if package is not None:
                 found[f"{kind}/{table.protocol}"] = package
         for source, (protocol, error) in self.not_loaded.items():
-            found[f"{source.partition('/')[0]}/{protocol}"] = error.package
+            if isinstance(error, NotLoadedError):
+                found[f"{source.partition('/')[0]}/{protocol}"] = error.package
         return found
 
     def attachment_names(self) -> list[tuple[str, str]]:

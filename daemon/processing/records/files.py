@@ -108,7 +108,9 @@ def _decoded(records: LogRecords, sources: Sequence[str], notes: list[str]) -> l
     """Return the sources that a driver reads; ``notes`` gets a line about each other one."""
     unread = [source for source in sources if records.protocol(source) == RAW]
     notes += [f"{source}: no driver reads it; swath export without --records writes its bytes" for source in unread]
-    return [source for source in sources if source not in unread]
+    lacking = {source: why for source, why in records.without_driver.items() if source in sources}
+    notes += [f"{source}: {why}" for source, why in lacking.items()]
+    return [source for source in sources if source not in unread and source not in lacking]
 
 
 def _write_all(

@@ -16,7 +16,7 @@ import numpy as np
 
 from swath.daemon.config.config import Config
 from swath.daemon.config.tables import ImuConfig
-from swath.daemon.errors import UserError
+from swath.daemon.errors import ConfigError, UserError
 from swath.daemon.log.chunk_index import LogIndex, index_log, read_chunks
 from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch, json_objects
@@ -82,8 +82,19 @@ class LogRecords:
             raise UserError(f"{session.parts[0].path}: {error}", error.exit_code) from error
 
     @cached_property
+    def without_driver(self) -> dict[str, str]:
+        """Why sources have no driver here, by source; their units can be read all the same."""
+        return {source: str(error) for source, (_, error) in self.config.without_driver().items()}
+
+    @cached_property
     def _sources(self) -> Sources:
-        return Sources(self.config, self.files, sorted(self.config.scanner))
+        """The devices; only receivers must have a driver, whose time is that of all."""
+        others = [source for source in self.without_driver if not source.startswith("gnss/")]
+        return Sources(self.config.with_raw(others), self.files, sorted(self.config.scanner))
+
+    @cached_property
+    def _wires(self) -> Sources:
+        return Sources(self.config.with_raw(self.without_driver), self.files)
 
     @cached_property
     def _index(self) -> LogIndex:
@@ -223,16 +234,18 @@ class LogRecords:
         return geometry_of(self.config.scanner[source.removeprefix("scanner/")], self._parser(source))
 
     def _parser(self, source: str) -> Parser:
+        if source in self.without_driver:
+            raise ConfigError(f"{source.replace('/', '.')}.protocol: {self.without_driver[source]}")
         return self._sources.parsers((self.sources[source],), whole=True)[source]
 
     def _batches(self, source: str, host_span: Span) -> Iterator[ChunkBatch]:
         """Yield the units of a source's wire from the chunks that reach into a span of host time."""
-        scanner = self.sources[source] == "scanner" or self._sources.is_in_scanner(source)
+        scanner = self.sources[source] == "scanner" or self._wires.is_in_scanner(source)
         start_ns, stop_ns = host_span
 
         def is_of_wire(topic: str) -> bool:
             wire = (source_of_topic(topic) or "").removesuffix("/aux")
-            return bool(wire) and source in self._sources.inside(wire)
+            return bool(wire) and source in self._wires.inside(wire)
 
         places = [
             place

@@ -143,7 +143,9 @@ def export_ros2(session: Session, directory: Path, *, overwrite: bool = False) -
 
 def _write(path: Path, export: RosExport, records: LogRecords) -> None:
     """Write all sources' messages, merged by the time of their arrival."""
-    tables = {source: records.tables(source, TABLES) for source in records.sources if records.protocol(source) != RAW}
+    read = [source for source in records.sources if records.protocol(source) != RAW]
+    tables = {source: records.tables(source, TABLES) for source in read if source not in records.without_driver}
+    export.notes += [f"{source}: {why}" for source, why in records.without_driver.items()]
     origin = first_place(tables)
     bodies = [source for source, found in tables.items() if len(found["solutions"])]
     streams = [_mounts(records)]
