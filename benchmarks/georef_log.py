@@ -270,7 +270,7 @@ def live_figures(log: Path, folder: Path, repeats: int) -> list[Figure]:
     points, live = (cost(work, bench.returns, repeats) for work in (bench.live_points, bench.replay))
     return [
         Figure("log to points", points, "ns"),
-        Figure("grid, thinning, live.mcap, status", live - points, "ns", 40.0, 40.0 * slower),
+        Figure("map, strips, thinning, live.mcap, status", live - points, "ns", 40.0, 40.0 * slower),
         Figure("all of it", live, "ns", 300.0, 300.0 * slower),
         Figure("share of a core, at 2 M points/s", live / 5.0, "%", 60.0, 60.0 * slower),
     ]

@@ -33,7 +33,7 @@ CELL_DTYPE = np.dtype(
         ("highest", "i2"),
         ("strip", "u2"),  # the newest
         ("difference", "i2"),  # of two strips, in millimetres
-        ("no_return", "u2"),  # pulses without a return
+        ("no_return", "u2"),  # pulses without a return; 0 so far
         ("strips", "u1"),
         ("compared", "u1"),  # 1: two strips have been compared
     ],

@@ -36,6 +36,7 @@ FOLDER = "live"  # in the log directory
 POLL_S = 0.05
 STATUS_S = 1.0
 COVERAGE_S = 10.0
+COVERAGE_SHARE = 100.0  # times as long as it takes; on large areas the coverage is saved less often
 SENT_WAIT_NS = 10_000_000_000  # how long a recording may go on until its scanners have sent their angles
 
 Told = dict[str, Any]
@@ -209,6 +210,7 @@ class Live:
         self._sent: SentFiles | None = None
         self._held: list[LogBatch] = []
         self._told_s = self._covered_s = -COVERAGE_S
+        self._coverage_s = COVERAGE_S
         self._trouble = ""
 
     def run(self, stopped: Callable[[], bool]) -> Told:
@@ -272,9 +274,10 @@ class Live:
         self._told_s = now_s
         if self._session is not None:
             self._session.look_for_room()
-            if now_s - self._covered_s > COVERAGE_S:
+            if now_s - self._covered_s > self._coverage_s:
                 self._covered_s = now_s
                 self._session.products.save_coverage(self._about())
+                self._coverage_s = max(COVERAGE_S, COVERAGE_SHARE * (time.monotonic() - now_s))
         waiting = "waiting for a recording to begin"
         if self._held and self._sent is not None:
             waiting = f"waiting for the angles of scanner {', '.join(self._sent.missing)}"

@@ -15,13 +15,14 @@ import rasterio
 from PIL import Image
 from pyproj import Transformer
 
+from swath.daemon.cli.main import run_app
 from swath.daemon.config.tables import LiveConfig
 from swath.daemon.processing.live.coverage import GEOTIFF, KMZ, write_coverage
 from swath.daemon.processing.live.products import LiveProducts
-from swath.daemon.processing.live.tiles import INDEX, TILES
+from swath.daemon.processing.live.tiles import INDEX, TILES, TileReader
 from swath.georef.arrays import FloatArray
 from swath.georef.timescales.gps_time import SECOND_NS
-from tests.daemon.processing.live.builders import Utm, flight, points_at
+from tests.daemon.processing.live.builders import PLAN, Utm, flight, points_at
 
 pytestmark = pytest.mark.xdist_group("kernels")
 
@@ -84,3 +85,41 @@ def test_what_cannot_be_exported_is_said(tmp_path: Path, monkeypatch: pytest.Mon
     (tmp_path / TILES / INDEX).write_text(json.dumps(index))
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert write_coverage(tmp_path) == ["coverage.tif is not written: it needs `pip install 'swath[gis]'`"]
+
+
+@pytest.mark.slow
+def test_painted_cells_are_those_of_the_truth(tmp_path: Path) -> None:
+    """Where echoes came from is known of a virtual flight, and PROJ maps it. Its end, for which the log has no pose any
+    more, is left out.
+    """
+    plan = tmp_path / "plan.toml"
+    plan.write_text(PLAN.replace("prf_hz = 5000", "prf_hz = 30000"))
+    log, out = tmp_path / "log", tmp_path / "out"
+    assert run_app(["sim", "fly", str(plan), "-o", str(log), "--seconds", "7"]) == 0
+    config = log / "true.toml"
+    text = (log / "swath.toml").read_text().replace(".nominal.toml", ".true.toml")
+    config.write_text(text)
+    assert run_app(["live", "--replay", str(log), "-o", str(out), "--accept-verdict", str(config)]) == 0
+    reader = TileReader(out)
+    assert reader.refresh()
+    extent_m, truth = reader.extent_m(), np.load(log / "truth.npz")
+    assert extent_m is not None
+    view = reader.view(*extent_m, reader.cell_m, ["points"])
+    assert view is not None
+    known_ns = json.loads((out / "live.json").read_text())["trajectory"]["covered_until_gps_ns"]
+    echoes_e = np.concatenate(
+        [truth[f"{name}.point_e"][truth[f"{name}.gps_ns"] <= known_ns] for name in ("left", "right")]
+    )
+    to_map = Transformer.from_crs("EPSG:4978", reader.index["crs"], always_xy=True)
+    east, north, _ = to_map.transform(*echoes_e.T)
+    origin = reader.index["origin"]
+    across = np.floor((east - origin[0] - view.west_m) / view.cell_m).astype(int)
+    up = np.floor((north - origin[1] - view.south_m) / view.cell_m).astype(int)
+    rows, columns = view.shape
+    covered = np.zeros((rows, columns), bool)
+    inside = (across >= 0) & (across < columns) & (up >= 0) & (up < rows)
+    covered[up[inside], across[inside]] = True
+    painted = view.layers["points"] > 0
+    assert inside.mean() > 0.999
+    assert covered.sum() > 5000  # 20,000 m²
+    assert np.count_nonzero(covered != painted) < 0.01 * covered.sum()
