@@ -182,15 +182,18 @@ def geopackage_layers(data: bytes) -> list[Layer]:
         LayerError: it cannot be read.
     """
     if len(data) < _SHORTEST_HEADER or not data.startswith(b"SQLite format 3\0"):
-        raise LayerError("cannot be read as a GeoPackage: it is no SQLite database")
+        raise LayerError("cannot be read as a GeoPackage: it is no SQLite database; save it anew")
     plain = bytearray(data)
     plain[_WAL_AT] = _ROLLBACK  # a database in memory has no write-ahead log
     database = sqlite3.connect(":memory:")
     try:
+        database.text_factory = lambda text: text.decode("utf-8", "replace")
         database.deserialize(bytes(plain))
         return list(_layers(database))
-    except sqlite3.Error as error:
-        raise LayerError(f"cannot be read as a GeoPackage: {error}") from error
+    except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
+        if isinstance(error, LayerError):
+            raise
+        raise LayerError(f"cannot be read as a GeoPackage: {error}; save it anew") from error
     finally:
         database.close()
 
@@ -253,8 +256,16 @@ def shapefile_layer(files: Mapping[str, bytes]) -> Layer:
                 values = list(reader.record(number - 1)) if ".dbf" in files else []
                 attributes = dict(zip(labels, values, strict=False))
                 features.append(Feature(f"feature {number}", attributes, _geometry_of_shape(module, shape)))
-    except (OSError, module.ShapefileException, struct.error, ValueError, IndexError, TypeError) as error:
-        raise LayerError(f"cannot be read as a shapefile: {' '.join(str(error).split())}") from error
+    except (
+        OSError,
+        module.ShapefileException,
+        struct.error,
+        ArithmeticError,
+        ValueError,
+        LookupError,
+        TypeError,
+    ) as error:
+        raise LayerError(f"cannot be read as a shapefile: {' '.join(str(error).split())}; save it anew") from error
     prj = files.get(".prj", b"").decode("utf-8", "replace").strip()
     return Layer("", code_of(prj) if prj else "", features)
 
@@ -300,5 +311,5 @@ def _geometry_of_shape(module: Any, shape: Any) -> Geometry:
 
 
 def _area(ring: FloatArray) -> float:
-    x, y = ring[:, 0], ring[:, 1]
+    x, y = np.clip(ring.T[:2], -1e12, 1e12)
     return math.fsum((x[:-1] - x[0]) * (y[1:] - y[0]) - (x[1:] - x[0]) * (y[:-1] - y[0])) / 2.0

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
+import io
 import json
 import random
 import struct
 import tempfile
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import laspy
 import numpy as np
+import pyogrio.raw
+import shapefile
 from pyproj import CRS
 
 from swath.calib.strips.cells import StripRules
+from swath.daemon.config.tables import PlanConfig
+from swath.daemon.processing.flightplan.geometry import LineGeometry
+from swath.daemon.processing.flightplan.plan import PlanError
+from swath.daemon.processing.flightplan.read import read_plan
 from swath.daemon.processing.navigation.outside_positions import outside_observations
 from swath.daemon.processing.quicklook.product_facts import rows_of, warnings_in
 from swath.daemon.processing.strips.inputs import strips_of_files
@@ -22,6 +30,7 @@ from swath.georef.formats.trajectory.csv import csv_text
 from swath.georef.formats.trajectory.file import read_trajectory
 from swath.georef.mapping.frame import Mapping
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryError
+from swath.sim.plan.plan import load_plan
 from tests.fuzz.engine import Target
 from tests.fuzz.mutation import damage
 from tests.fuzz.texts import NUMBERS, OF_CSV, OF_JSON, changed_text, told
@@ -58,6 +67,7 @@ def office_file_targets() -> Iterator[tuple[str, Callable[[], Target]]]:
     yield "sbet", _sbets
     yield "antenna-positions", _positions
     yield "points", _points
+    yield "plan", _plans
     yield "points-sidecar", _beside_points
 
 
@@ -254,3 +264,54 @@ def _beside_points() -> Target:
         return changed_text(rng, head, words) + parted + path
 
     return Target("points-sidecar", seeds, mutate, run, None, lambda size: (256 << 20) + 400 * size)
+
+
+# --- flight plans ---------------------------------------------------------------------------------------------------
+
+_PLACEMARK = (
+    b"<kml><Placemark><name>4</name><LineString><altitudeMode>relativeToGround</altitudeMode>"
+    b"<coordinates>8.9,47.5,800 8.95,47.52,800</coordinates></LineString></Placemark></kml>"
+)
+_GEOJSON = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "properties": {"name": "4"}, "geometry":
+{"type": "MultiLineString", "coordinates": [[[8.9, 47.5, 1500], [8.95, 47.52, 1500]]]}}, {"type": "Feature", "geometry":
+{"type": "Polygon", "coordinates": [[[8.8, 47.4], [9.0, 47.4], [9.0, 47.6], [8.8, 47.4]]]}}]}"""
+
+
+def _plans() -> Target:
+    """Return the target of flight plans; a case is the file's suffix, a line's end, and its content."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("doc.kml", _PLACEMARK)
+    shape = io.BytesIO()
+    with shapefile.Writer(shp=shape, shx=io.BytesIO(), dbf=io.BytesIO(), shapeType=shapefile.POLYLINEZ) as writer:
+        writer.field("name", "C")
+        writer.linez([[[8.9, 47.5, 1500.0], [8.95, 47.52, 1500.0]]])
+        writer.record("4")
+    line = struct.pack("<BII4d", 1, 2, 2, 8.9, 47.5, 8.95, 47.52)
+    with tempfile.TemporaryDirectory(prefix="swath-fuzz-") as folder:
+        path = Path(folder, "plan.gpkg")
+        pyogrio.raw.write(path, np.array([line], dtype=object), [np.array(["4"], dtype=object)], ["name"],
+                          geometry_type="LineString", crs="EPSG:4326", driver="GPKG")  # fmt: skip
+        package = path.read_bytes()
+    sim = load_plan("small").text.encode()
+    contents = {".kml": _PLACEMARK, ".kmz": packed.getvalue(), ".geojson": _GEOJSON, ".toml": sim, ".gpkg": package}
+    seeds = [suffix.encode() + b"\n" + data for suffix, data in (contents | {".shp": shape.getvalue()}).items()]
+
+    def read(data: bytes) -> set[str]:
+        suffix, _, content = data.partition(b"\n")
+        config = PlanConfig(file=f"plan{suffix.decode('utf-8', 'replace')}", crs="EPSG:4326")
+
+        def seen() -> Iterator[str]:
+            plan = read_plan(config, {str(config.file): content})
+            assert plan is not None
+            places = LineGeometry(plan.lines).places(np.array([0.83]), np.array([0.16]))
+            assert np.isfinite(places.distance_m).all()
+            yield from [*plan.notes, *(f"line {line.name}" for line in plan.lines)]
+
+        return told(seen, PlanError)
+
+    def change(rng: random.Random, base: bytes) -> bytes:
+        suffix, _, content = base.partition(b"\n")
+        return suffix + b"\n" + damage(rng, content)
+
+    return Target("plan", seeds, change, read)

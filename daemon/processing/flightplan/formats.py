@@ -10,6 +10,7 @@ import json
 import math
 import re
 import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -69,7 +70,7 @@ def read_kml(data: bytes) -> Drawn:
     try:
         parser.feed(data)
         root = parser.close()
-    except (ParseError, ValueError) as error:
+    except (ParseError, ValueError, LookupError) as error:  # the last: of an unknown encoding
         if isinstance(error, PlanError):
             raise
         raise PlanError(f"is not KML: {error}; export it anew") from error
@@ -148,7 +149,7 @@ def read_kmz(data: bytes) -> Drawn:
                 inner = read_kml(text)
                 drawn.features.extend(inner.features)
                 drawn.heights.extend(inner.heights)
-    except (zipfile.BadZipFile, OSError, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
+    except (zipfile.BadZipFile, zlib.error, OSError, EOFError, NotImplementedError, RuntimeError, ValueError) as error:
         if isinstance(error, PlanError):
             raise
         raise PlanError(f"is not a KMZ archive: {error}; save it anew") from error

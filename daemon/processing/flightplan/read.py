@@ -33,10 +33,13 @@ from swath.daemon.processing.flightplan.formats import (
 from swath.daemon.processing.flightplan.plan import FlightPlan, PlanError, PlannedLine
 from swath.daemon.processing.vector_layers import Feature, LayerError, geopackage_layers, shapefile_layer
 from swath.georef.arrays import FloatArray
+from swath.georef.geodesy.earth import e_from_geodetic
 
 MAX_LINES, MAX_VERTICES = 2_000, 200_000
 USUAL_NAMES = ("name", "line", "line_name", "linename", "line_no", "lineno", "line_id", "lineid", "label", "id", "fid")
 SAME_PLACE_DEG = 1e-8  # 1 mm: parts of a line that touch are one line
+SHORTEST_M, LONGEST_M = 0.001, 2_000_000.0  # between two vertices
+BEYOND = 1e9  # no coordinate on earth is larger, in whatever unit
 NAME_CHARACTERS = 60
 EGM96 = "EPSG:4326+5773"  # of KML's absolute altitudes (OGC 12-007r2, 9.20)
 
@@ -153,8 +156,6 @@ class _Places:
 
     def degrees(self, where: str, rows: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return latitudes and longitudes (n,) in degrees."""
-        if not np.isfinite(rows[:, :2]).all():
-            raise PlanError(f"{where}: has a position that is no number; save it anew")
         lon, lat = self._plane.transform(rows[:, 0], rows[:, 1])
         lat, lon = np.asarray(lat), np.asarray(lon)
         if not (np.isfinite(lat).all() and np.isfinite(lon).all()):
@@ -218,6 +219,7 @@ def _lines(config: PlanConfig, layers: Sequence[Drawn], notes: list[str]) -> lis
     for number, (one, index) in enumerate(drawn, start=1):
         feature = one.features[index]
         name = _name(feature, label) or str(number)
+        _refuse_infinite(f"line {name} ({feature.where})", feature.geometry.lines)
         parts = _joined(feature.geometry.lines)
         for part, rows in enumerate(parts, start=1):
             where = f"line {name} ({feature.where})"
@@ -225,6 +227,7 @@ def _lines(config: PlanConfig, layers: Sequence[Drawn], notes: list[str]) -> lis
             if len(rows) < 2:
                 raise PlanError(f"{where}: has no two different vertices; remove it or draw it anew")
             lat, lon = places[id(one)].degrees(where, rows)
+            _refuse_steps(where, lat, lon)
             height_m, above_m = places[id(one)].heights(where, rows, one.heights[index])
             speed = one.speeds[index] if one.speeds else math.nan
             lines.append(PlannedLine(name if len(parts) == 1 else f"{name}-{part}", lat, lon, height_m, above_m, speed))
@@ -255,6 +258,21 @@ def _name(feature: Feature, label: str | None) -> str:
     if isinstance(value, float) and value.is_integer():
         value = int(value)
     return one_line(str(value)).strip()[:NAME_CHARACTERS]
+
+
+def _refuse_infinite(where: str, parts: Sequence[FloatArray]) -> None:
+    if any(not (np.abs(rows[:, :2]) < BEYOND).all() for rows in parts):
+        raise PlanError(f"{where}: has a position that is no place on earth; save it anew")
+
+
+def _refuse_steps(where: str, lat_deg: FloatArray, lon_deg: FloatArray) -> None:
+    """Refuse neighbouring vertices that are at one place on earth, or on different continents."""
+    e = e_from_geodetic(np.radians(lat_deg), np.radians(lon_deg), np.zeros(len(lat_deg)))
+    steps_m = np.linalg.norm(np.diff(e, axis=0), axis=1)
+    if steps_m.min() < SHORTEST_M:
+        raise PlanError(f"{where}: has two vertices in one place; remove one")
+    if steps_m.max() > LONGEST_M:
+        raise PlanError(f"{where}: has vertices {steps_m.max() / 1000.0:.0f} km apart; mend them, or set plan.crs")
 
 
 def _joined(parts: Sequence[FloatArray]) -> list[FloatArray]:
@@ -304,6 +322,7 @@ def _polygons_of(config: PlanConfig, one: Drawn) -> Iterator[tuple[FloatArray, .
     places = _Places(one.crs, config) if drawn else None
     for where, polygon in drawn:
         rings = []
+        _refuse_infinite(where, polygon)
         for ring in polygon:
             if len(ring) < 4:
                 raise PlanError(f"{where}: a ring of its polygon has {len(ring)} vertices, fewer than 4; draw it anew")

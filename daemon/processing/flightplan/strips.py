@@ -128,13 +128,12 @@ class StripWatch:
         for line in self.lines:
             line.refresh()
         last = len(self.lines) - 1
-        return {
-            "plan": None,
-            "lines": [plain_line(line, is_flying=self._is_flying and at == last) for at, line in enumerate(self.lines)],
-            "current": self.lines[-1].name if self._is_flying else None,
-            "next": None,
-            "steering": None,
-        }
+        lines = [plain_line(line, is_flying=self._is_flying and at == last) for at, line in enumerate(self.lines)]
+        return {"plan": None, "lines": lines} | self.plain_steering()
+
+    def plain_steering(self) -> dict[str, Any]:
+        """Return the strip that is flown; there is nothing to steer to."""
+        return {"current": self.lines[-1].name if self._is_flying else None, "next": None, "steering": None}
 
     def plain_geometry(self) -> dict[str, Any]:
         """Return the way of each strip in degrees, for maps."""

@@ -300,11 +300,14 @@ class LineWatch:
         """Return the state of all lines as plain values, without the geometry."""
         self.refresh()
         current = None if self.current is None else self.current.line
+        lines = [plain_line(line, is_flying=place == current) for place, line in enumerate(self.lines)]
+        return {"plan": self.plan.name, "lines": lines} | self.plain_steering()
+
+    def plain_steering(self) -> dict[str, Any]:
+        """Return the line that is flown, the next one, and how to steer, as plain values."""
         bank_deg = self._config.tolerance.bank_deg
         return {
-            "plan": self.plan.name,
-            "lines": [plain_line(line, is_flying=place == current) for place, line in enumerate(self.lines)],
-            "current": None if current is None else self.lines[current].name,
+            "current": None if self.current is None else self.lines[self.current.line].name,
             "next": self.next_line,
             "steering": None if self.steering is None else self.steering.plain(bank_deg),
         }

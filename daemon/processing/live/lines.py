@@ -34,7 +34,7 @@ from swath.georef.timescales import TimeState
 from swath.georef.timescales.gps_time import SECOND_NS
 from swath.georef.trajectory.trajectory import Trajectory, TrajectoryGapError
 
-LINES = "lines.json"
+LINES, STEERING = "lines.json", "steering.json"
 VERSION = 1
 FIX_LASTS_NS = 2 * SECOND_NS  # an older position is none
 SAMPLE = 400  # points of a scanner and moment by which the swath is measured
@@ -74,7 +74,7 @@ class LiveLines:
         self._stream, self._mapping, self._path = stream, setup.mapping, folder / LINES
         self._moments = Moments(stream.scanners)
         self._frame: LocalFrame | None = None
-        self._next_ns = -(1 << 62)
+        self._next_ns = self._steered_ns = -(1 << 62)
         self._fixes: dict[str, tuple[FixType, int]] = {}  # by receiver: quality and host time of the newest position
         self._seen: dict[str, list[int]] = {}  # by scanner: returns, and pulses without one, since the last tick
         self._lost = Counter[str]()
@@ -261,11 +261,12 @@ class LiveLines:
         return {"lines": lines}
 
     def save(self, log_time_ns: int, *, last: bool = False) -> None:
-        """Write ``lines.json`` once a second of log time, if something changed.
+        """Write ``lines.json`` once a second of log time, and ``steering.json`` five times, if something changed.
 
         Raises:
-            OSError: it cannot be written.
+            OSError: they cannot be written.
         """
+        self._save_steering()
         if log_time_ns < self._saved_ns + SECOND_NS and not last:
             return
         self._saved_ns = log_time_ns
@@ -275,3 +276,11 @@ class LiveLines:
         if data != self._written:
             replace_file(self._path, data)
             self._written = data
+
+    def _save_steering(self) -> None:
+        """Write how to steer by the newest pose; a page for the pilot reads it."""
+        if self._steered_ns == self._next_ns:
+            return
+        self._steered_ns = self._next_ns
+        found = {"version": VERSION, "gps_ns": self._next_ns - STEP_NS} | self.watch.plain_steering()
+        replace_file(self._path.with_name(STEERING), (json.dumps(found) + "\n").encode())

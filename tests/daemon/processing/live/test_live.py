@@ -234,6 +234,9 @@ class TestStatus:
         assert one["flown_from_m"] == 0.0
         assert one["flown_to_m"] == pytest.approx(250.0, abs=25.0)
         assert len(lines["geometry"]["lines"]["1"]) == 2
+        steering = json.loads((folder / "steering.json").read_text())
+        assert steering["steering"]["line"] == steering["current"] == "1"  # at the last pose, before the end
+        assert steering["gps_ns"] == one["end_gps_ns"]
         assert found["lines"]["fly_again"] == ["1"]
         assert "FLY AGAIN: 1;" in found["sentence"] + ";"
         assert found["gnss"]["gnss/rover"]["fix"] == "rtk_fixed"
