@@ -235,7 +235,7 @@ class TestStatus:
         assert one["flown_to_m"] == pytest.approx(250.0, abs=25.0)
         assert len(lines["geometry"]["lines"]["1"]) == 2
         steering = json.loads((folder / "steering.json").read_text())
-        assert steering["steering"]["line"] == steering["current"] == "1"  # at the last pose, before the end
+        assert (steering["current"], steering["next"], steering["steering"]) == (None, "1", None)  # after the end
         assert steering["gps_ns"] == one["end_gps_ns"]
         assert found["lines"]["fly_again"] == ["1"]
         assert "FLY AGAIN: 1;" in found["sentence"] + ";"
