@@ -36,8 +36,8 @@ test-slow: $(VENV)/.tests $(VENV)/.tools ready ## run the longer tests: whole fl
 	$(PYTEST) -n $(JOBS) --dist loadgroup -m "slow and not long and not alone and not peers"
 	$(call PYTEST,-alone) -n 0 -m "alone and slow and not long"
 
-test-peers: $(VENV)/.tests ## run the tests against gpsd and Foxglove's reader, which it installs (root, apt, npm)
-	@for program in gpsd npm; do command -v $$program >/dev/null || \
+test-peers: $(VENV)/.tests ## run the tests against gpsd, Foxglove's reader and Chromium, which it installs (root, apt, npm)
+	@for program in gpsd npm chromium; do command -v $$program >/dev/null || \
 		{ apt-get -qq update && apt-get -qq install -y --no-install-recommends $$program >/dev/null; } || exit; done
 	npm ci --silent --no-audit --no-fund --prefix tests/peers
 	$(PYTEST) -n 0 -v tests/peers

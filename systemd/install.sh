@@ -4,14 +4,14 @@
 #   PREFIX   where the program goes, /opt/swath by default; the unit's paths follow
 #   DESTDIR  a root to install into, for packagers: nothing is then started, created or loaded
 #   PYTHON   the system's Python 3.11 or newer; not one in a home directory, which the service cannot see
-#   EXTRAS   what goes with it beside recording, process,live by default (swath live, swath georef); empty: nothing
+#   EXTRAS   what goes with it beside recording, process,live,console by default (swath live, georef, console); empty: nothing
 set -eu
 
 DESTDIR=${DESTDIR-}
 PREFIX=${PREFIX:-/opt/swath}
 PREFIX=${PREFIX%/}
 PYTHON=${PYTHON:-/usr/bin/python3}
-EXTRAS=${EXTRAS-process,live}
+EXTRAS=${EXTRAS-process,live,console}
 cache=/var/cache/swath-live
 source=$(cd "$(dirname "$0")/.." && pwd)
 
@@ -27,6 +27,7 @@ placed() {
 swathd.service /usr/lib/systemd/system/swathd.service
 swathd@.service /usr/lib/systemd/system/swathd@.service
 swath-live.service /usr/lib/systemd/system/swath-live.service
+swath-console.service /usr/lib/systemd/system/swath-console.service
 swath-pps@.service /usr/lib/systemd/system/swath-pps@.service
 sysctl/90-swath.conf /usr/lib/sysctl.d/90-swath.conf
 network/80-swath-can.network /usr/lib/systemd/network/80-swath-can.network

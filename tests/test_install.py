@@ -19,6 +19,7 @@ PLACED = {
     "etc/swath/swath.toml",
     "usr/lib/sysctl.d/90-swath.conf",
     "usr/lib/systemd/network/80-swath-can.network",
+    "usr/lib/systemd/system/swath-console.service",
     "usr/lib/systemd/system/swath-live.service",
     "usr/lib/systemd/system/swathd@.service",
     "usr/lib/systemd/system/swath-pps@.service",

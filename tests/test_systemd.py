@@ -15,6 +15,7 @@ from tests.daemon.rig import HANGS_S
 
 UNIT = SYSTEMD / "swathd.service"
 LIVE = SYSTEMD / "swath-live.service"
+CONSOLE = SYSTEMD / "swath-console.service"
 PPS = SYSTEMD / "swath-pps@.service"
 HARDENING = [
     "CapabilityBoundingSet", "AmbientCapabilities", "NoNewPrivileges", "ProtectSystem", "ProtectHome",
@@ -167,6 +168,32 @@ class TestPps:
         (wanted,) = re.findall(r'ENV\{SYSTEMD_WANTS\}\+="([^"]*)"', rule)
         assert wanted == PPS.name.replace("@", "@ttyS0")
         assert 'TAG+="systemd"' in rule
+
+
+class TestConsole:
+    """The unit of the operator's console."""
+
+    def test_the_unit_passes_verification(self, tmp_path: Path) -> None:
+        unit = tmp_path / CONSOLE.name
+        unit.write_text(CONSOLE.read_text().replace("/opt/swath/bin/swath", "/bin/true"))
+        found = run_tool("systemd-analyze", "verify", "--man=no", unit)
+        assert (found.returncode, found.stderr, found.stdout) == (0, "", "")
+
+    def test_exposure_is_at_most_two(self) -> None:
+        found = run_tool("systemd-analyze", "security", "--offline=true", "--threshold=20", "--no-pager", CONSOLE)
+        assert "Overall exposure level for swath-console.service" in found.stdout, found.stderr
+        assert found.returncode == 0, found.stdout
+
+    def test_the_unit_is_hardened_like_live_and_writes_its_tokens_only(self) -> None:
+        for name in HARDENING:
+            if name not in ("UMask", "User", "RestrictAddressFamilies"):
+                assert unit_values(name, CONSOLE) == unit_values(name, LIVE) != [], name
+        assert unit_values("MemoryDenyWriteExecute", CONSOLE) == ["yes"]
+        assert unit_values("StateDirectory", CONSOLE) == ["swath-console"]
+        assert unit_values("ReadWritePaths", CONSOLE) == []
+        assert unit_values("User", CONSOLE) == ["swath-console"]
+        assert unit_values("Group", CONSOLE) == ["swath"]
+        assert "BindsTo" not in CONSOLE.read_text()
 
 
 def test_the_second_recorder_is_the_first_with_places_of_its_own(tmp_path: Path) -> None:

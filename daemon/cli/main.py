@@ -32,7 +32,7 @@ from swath.daemon.system import keep_freed_memory
 INTERRUPTED = 130  # 128 + SIGINT, as in shells
 PIPE_CLOSED = 141  # 128 + SIGPIPE
 CLEANING_S = 5.0  # after an interrupt, during which another one does not disturb the removal of unfinished files
-WITHOUT_FILES = ("run", "mark", "split", "check", "monitor", "live", "info", "devices", "doctor", "setup")
+WITHOUT_FILES = ("run", "mark", "split", "check", "monitor", "live", "console", "info", "devices", "doctor", "setup")
 
 COMPLETE_VARIABLE = "_SWATH_COMPLETE"  # set by the script of `swath completion` when it asks
 
@@ -42,7 +42,7 @@ HELP = """Record, georeference and calibrate an airborne laser scanner.
 """
 EPILOG = (
     "Exit codes: 0 ok, 1 problem found, 2 wrong configuration or usage, 3 cannot read or write, 4 damaged data, "
-    "130 interrupted. See `swath COMMAND --help` for details."
+    "130 interrupted."
 )
 
 
@@ -68,6 +68,7 @@ COMMANDS = (
     Listed("split", "Begin a new part of the log being recorded.", "Record"),
     Listed("monitor", "Show a running recorder live: rates, losses, time, disk.", "Record"),
     Listed("live", "Georeference the running recording and show it.", "Record"),
+    Listed("console", "Serve pages that show the operator what is recorded.", "Record"),
     Listed("info", "Report what logs hold: counts, gaps, losses, time.", "Logs"),
     Listed("replay", "Play the bytes of a log back on wires.", "Logs"),
     Listed("import", "Make a log from captures: pcap, candump, serial bytes.", "Logs"),

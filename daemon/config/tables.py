@@ -556,6 +556,22 @@ class LiveConfig(Section):
     )
 
 
+class ConsoleConfig(Section):
+    """``[console]``: the operator's pages, served by `swath console`."""
+
+    listen: str = Field(
+        "127.0.0.1:8470",
+        pattern=r"^(\[[0-9a-fA-F:.]+\]|[0-9.]+):[0-9]{1,5}$",
+        description="address and port; beyond this computer (not 127.0.0.1 or [::1]) tokens and TLS are needed",
+    )
+    names: list[str] = Field(
+        default_factory=list, max_length=16, description="further names by which tablets call this computer"
+    )
+    marks: list[Annotated[str, Field(min_length=1, max_length=80)]] = Field(
+        default_factory=list, max_length=8, description="texts of the marks of the keys F1 to F8"
+    )
+
+
 class Tables(Section):
     """The whole configuration file."""
 
@@ -574,3 +590,4 @@ class Tables(Section):
     calibration: CalibrationConfig = Field(default_factory=CalibrationConfig)
     plan: PlanConfig = Field(default_factory=PlanConfig)
     live: LiveConfig = Field(default_factory=LiveConfig)
+    console: ConsoleConfig = Field(default_factory=ConsoleConfig)

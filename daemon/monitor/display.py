@@ -187,6 +187,7 @@ class Monitor:
             "directory": str(self._directory),
             "session_id": None if self._part is None else self._part.info.session_id,
             "part": None if self._part is None else self._part.number,
+            "begun_ns": None if self._part is None else self._part.info.realtime_ns,
             "troubles": troubles,
             "sources": sources,
             "bytes_per_s": round(rate),

@@ -17,6 +17,11 @@ EXTRA_OF = {
     "rosbags": "import",
     "rasterio": "gis",
     "fudgeo": "gis",
+    "starlette": "console",
+    "uvicorn": "console",
+    "xstatic": "console",
+    "cryptography": "console",
+    "segno": "console",
 }  # package: the extra that installs it, if not process
 
 

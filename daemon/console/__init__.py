@@ -1,0 +1,1 @@
+"""Serves the operator's console: pages that show what recorder and live write, and that ask the recorder for marks."""

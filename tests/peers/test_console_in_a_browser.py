@@ -1,0 +1,243 @@
+"""Tests the console's pages in Chromium: read and pressed as a person would, and looked at by their pixels."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from numpy.typing import NDArray
+from PIL import Image
+from playwright.sync_api import Browser, Page, expect, sync_playwright
+
+from swath.daemon.console.painting import RAMPS
+from swath.daemon.processing.live.tiles import SIDE
+from tests.daemon.console.builders import Asked, console, write_map
+from tests.daemon.log_check import read_log
+from tests.daemon.rig import Recorder, free_udp_port, session_table, wait_until
+
+pytestmark = pytest.mark.peers
+
+SCRIPT = "<img src=x onerror=alert(1)>"
+SIZES = ((1920, 1080), (1280, 800), (800, 1280))
+WAIT_MS = 20_000.0
+SCALE = "30 m"  # at four pixels a metre
+CELLS = 40  # along each side of the square that is painted
+# as WCAG 2.1 AA, which axe knows by these names
+RULES = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "best-practice"]}
+
+
+@dataclass
+class Opened:
+    """A page, the addresses that it asked and the errors that it told."""
+
+    page: Page
+    asked: list[str] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    program = shutil.which("chromium") or shutil.which("chromium-browser")
+    assert program is not None, "there is no chromium: make test-peers installs it"
+    with sync_playwright() as playwright:
+        opened = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def open_page(browser: Browser) -> Iterator[Callable[..., Opened]]:
+    contexts = []
+
+    def opened(address: str, size: tuple[int, int] = SIZES[0], scheme: str = "light") -> Opened:
+        context = browser.new_context(
+            viewport={"width": size[0], "height": size[1]},
+            color_scheme="dark" if scheme == "dark" else "light",
+        )
+        contexts.append(context)
+        found = Opened(context.new_page())
+        found.page.on("request", lambda request: found.asked.append(request.url))
+        found.page.on("console", lambda told: found.errors.append(told.text) if told.type == "error" else None)
+        found.page.on("pageerror", lambda error: found.errors.append(str(error)))
+        found.page.on("dialog", lambda dialog: found.errors.append(f"dialog: {dialog.message}"))
+        found.page.goto(address)
+        return found
+
+    yield opened
+    for context in contexts:
+        context.close()
+
+
+@pytest.fixture(scope="module")
+def aircraft(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Asked, Path]]:
+    """Record a source that is silent, with a map and lines as live writes them."""
+    folder = tmp_path_factory.mktemp("aircraft")
+    logs = folder / "logs"
+    logs.mkdir()
+    config = session_table(logs) + f'[raw.camera]\ntransport = "udp:127.0.0.1:{free_udp_port()}"\n'
+    config += '[console]\nmarks = ["line start"]\n'
+    with Recorder(folder, config) as recorder, console(recorder.config) as (asked, _):
+        write_live(logs / "live")
+        wait_until(lambda: asked.snapshot()["sources"], "a source")
+        yield asked, logs
+
+
+def write_live(live: Path) -> None:
+    """Write a square of `CELLS` metres with three points a square metre, the aircraft in its middle, two lines."""
+    points = np.zeros((SIDE, SIDE), np.uint32)
+    points[:CELLS, :CELLS] = 3
+    write_map(live, {(0, 0): {"points": points, "height": np.where(points > 0, 5.0, np.nan)}})
+    middle = CELLS / 2
+    pose = {"east_m": middle, "north_m": middle, "heading_deg": 90.0, "track_deg": 90.0, "sigma_m": [0.02, 0.02, 0.04]}
+    (live / "live.json").write_text(json.dumps({"state": "following", "pose": pose, "tiles": {"sequence": 1}}))
+    again = {"name": "9", "state": "again", "flown_fraction": 0.5, "reasons": [{"text": f"GNSS lost {SCRIPT}"}]}
+    flying = {"name": "4", "state": "flying", "flown_fraction": 0.25, "reasons": []}
+    steering = {"line": "4", "cross_track_m": -12.0, "height_m": 7.0, "track_error_deg": 1.5, "to_begin_m": -400.0,
+                "to_end_m": 1200.0, "to_begin_s": None, "to_end_s": 24.0, "speed_mps": 50.0, "wanted_speed_mps": 52.0,
+                "bank_deg": 3.0, "bank_limit_deg": 20.0}  # fmt: skip
+    lines = {"lines": [flying, again], "current": "4", "next": "9", "steering": steering}
+    (live / "lines.json").write_text(json.dumps(lines))
+
+
+def keep_current(live: Path) -> None:
+    """Give live's status a new time, as live does each second."""
+    (live / "live.json").touch()
+
+
+def test_header_sensors_and_lines_say_what_is(aircraft: tuple[Asked, Path], open_page: Callable[..., Opened]) -> None:
+    asked, logs = aircraft
+    keep_current(logs / "live")
+    page = open_page(asked.url).page
+    expect(page.locator("#state")).to_have_text("DEGRADED", timeout=WAIT_MS)
+    expect(page.locator("#state-shape")).to_have_text("▲")
+    expect(page.locator("#sentence")).to_contain_text("raw/camera", timeout=WAIT_MS)
+    rows = page.locator("#lines-rows tr")
+    expect(rows).to_have_count(2)
+    expect(rows.nth(1)).to_contain_text("FLY AGAIN")
+    expect(rows.nth(1)).to_contain_text(f"GNSS lost {SCRIPT}")  # as text, not as a picture
+    page.get_by_role("tab", name="Sensors").click()
+    expect(page.locator("#sensor-rows tr")).to_contain_text(["raw/camera"])
+    page.get_by_role("tab", name="Graphs").click()
+    expect(page.locator(".graph", has_text="disk free, GB")).to_be_visible()
+
+
+def test_marks_are_written_by_button_and_key(aircraft: tuple[Asked, Path], open_page: Callable[..., Opened]) -> None:
+    asked, logs = aircraft
+    opened = open_page(asked.url)
+    page = opened.page
+    page.get_by_label("Mark", exact=True).fill(SCRIPT)
+    page.get_by_role("button", name="Write").click()
+    expect(page.locator("#answer")).to_contain_text(f"UTC: {SCRIPT}", timeout=WAIT_MS)
+    page.keyboard.press("F1")
+    expect(page.locator("#answer")).to_contain_text("line start", timeout=WAIT_MS)
+    page.get_by_role("tab", name="Events").click()
+    expect(page.locator("#event-rows li", has_text=SCRIPT)).to_be_visible(timeout=WAIT_MS)
+
+    def marks() -> list[str]:
+        logged = [read_log(path).events("mark") for path in sorted(logs.glob("*.mcap"))]
+        return [event["text"] for events in logged for event in events]
+
+    wait_until(lambda: marks()[-2:] == [SCRIPT, "line start"], "both marks in the log")
+    assert opened.errors == []
+
+
+def test_no_page_asks_another_machine_or_breaks_the_policy(
+    aircraft: tuple[Asked, Path], open_page: Callable[..., Opened]
+) -> None:
+    asked, _ = aircraft
+    for path in ("/", "/pilot", "/login"):
+        opened = open_page(asked.url + path)
+        opened.page.wait_for_timeout(2500)
+        assert {urlsplit(address).netloc for address in opened.asked if not address.startswith(("data:", "blob:"))} == {
+            urlsplit(asked.url).netloc
+        }
+        assert opened.errors == [], path
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_every_cell_is_painted_and_nothing_else(
+    aircraft: tuple[Asked, Path], open_page: Callable[..., Opened], size: tuple[int, int]
+) -> None:
+    asked, _ = aircraft
+    page = open_page(asked.url, size).page
+    page.get_by_label("Show").select_option("density")
+    scale = page.locator(".leaflet-control-scale-line")
+    for _ in range(20):  # a click while the map still moves has no effect
+        if scale.text_content() == SCALE:
+            break
+        page.get_by_role("button", name="Zoom in").click()
+        page.wait_for_timeout(700)
+    colour = np.array([int(RAMPS["density"][2][i : i + 2], 16) for i in (1, 3, 5)])
+    pixel_m = 0.25
+    wanted = (CELLS / pixel_m) ** 2
+
+    def painted() -> NDArray[np.bool_]:
+        shot = Image.open(io.BytesIO(page.locator("#map").screenshot())).convert("RGB")
+        found = np.abs(np.asarray(shot, int) - colour).max(axis=-1) <= 2
+        reach = round(CELLS / pixel_m)  # beyond, the legend shows the same colour
+        rows, columns = (np.arange(length) - length // 2 for length in found.shape)
+        return np.asarray(found & (np.abs(rows) < reach)[:, None] & (np.abs(columns) < reach))
+
+    def is_whole() -> bool:
+        found = painted()
+        rows, columns = np.nonzero(found)
+        hidden = 36**2  # of the aircraft's sign
+        sides = [np.ptp(places) + 1 - CELLS / pixel_m for places in (rows, columns) if len(places)]
+        # where the map's own place is no whole pixel, the pixels at an edge are mixed
+        return len(rows) > 0.99 * wanted - hidden and bool(max(map(abs, sides), default=9.0) <= 1.0)
+
+    wait_until(is_whole, "the square of cells, to a pixel", 60.0)
+    rows, columns = np.nonzero(painted())
+    frame = page.locator("#map").bounding_box()
+    assert frame is not None
+    assert abs(rows.mean() - frame["height"] / 2) < 3.0  # the aircraft is in the middle of both
+    assert abs(columns.mean() - frame["width"] / 2) < 3.0
+
+
+@pytest.mark.parametrize("path", ["/", "/pilot", "/login"])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_no_barrier_is_found(
+    aircraft: tuple[Asked, Path], open_page: Callable[..., Opened], path: str, scheme: str
+) -> None:
+    asked, logs = aircraft
+    keep_current(logs / "live")
+    page = open_page(asked.url + path, SIZES[2], scheme).page
+    page.wait_for_timeout(2500)
+    found: Any = Axe().run(page, options=RULES)
+    told = [f"{one['id']}: {[node['html'] for node in one['nodes']]}" for one in found.response["violations"]]
+    assert told == []
+
+
+def test_the_pilot_s_page_has_the_figures_of_the_line(
+    aircraft: tuple[Asked, Path], open_page: Callable[..., Opened]
+) -> None:
+    asked, logs = aircraft
+    keep_current(logs / "live")
+    page = open_page(asked.url + "/pilot", SIZES[1]).page
+    wanted = {"line": "Line 4", "next": "next: 9", "cross": "L 12 m", "height": "+7 m", "track": "+1.5°",
+              "end": "1,200 m 24 s", "speed": "50.0 / 52.0 m/s", "bank": "3° / 20°"}  # fmt: skip
+    for name, text in wanted.items():
+        expect(page.locator(f"#{name}")).to_have_text(text, timeout=WAIT_MS)
+
+
+def test_a_page_without_its_console_says_so_and_is_whole_again(
+    tmp_path: Path, open_page: Callable[..., Opened]
+) -> None:
+    (tmp_path / "live").mkdir()
+    with console(tmp_path) as (asked, process):
+        page = open_page(asked.url).page
+        expect(page.locator("#state")).to_have_text("NOT RECORDING", timeout=WAIT_MS)
+        process.kill()
+        expect(page.locator("#state")).to_have_text("CONSOLE SILENT", timeout=WAIT_MS)
+        expect(page.locator("#sentence")).to_contain_text("is not known here")
+    with console(tmp_path, port=asked.port):
+        expect(page.locator("#state")).to_have_text("NOT RECORDING", timeout=WAIT_MS)
