@@ -47,9 +47,7 @@ def command(
             print(f"{loaded.path}: valid; {count}: {', '.join(sources) or 'none'}")
         else:
             _print_reports(reports)
-        for line in [planned] if planned else []:
-            print(line)
-        for line in [*geometry_lines(placed), *drawing(placed)]:
+        for line in [*planned, *geometry_lines(placed), *drawing(placed)]:
             print(line)
         _print_findings(findings)
     if wrong:
@@ -85,27 +83,27 @@ def _crs_findings(config: Config) -> list[str]:
     return lines
 
 
-def _planned(config: Config) -> tuple[str, list[str]]:
-    """Return the size of the flight plan in a line, and what is wrong or was assumed; PROJ may be absent."""
+def _planned(config: Config) -> tuple[list[str], list[str]]:
+    """Return the size of the flight plan and what was assumed, a line each, and what is wrong; PROJ may be absent."""
     if config.tables.plan.file is None:
-        return "", []
+        return [], []
     try:
         from swath.daemon.processing.flightplan.geometry import LineGeometry
         from swath.daemon.processing.flightplan.plan import PlanError
         from swath.daemon.processing.flightplan.read import plan_of
     except ImportError:
-        return "", []
+        return [], []
     try:
         plan = plan_of(config, {name: data for name, _, data in config.attachments()})
     except PlanError as error:
-        return "", [f"plan.file: {error}"]
+        return [], [f"plan.file: {error}"]
     if plan is None:
-        return "", []
+        return [], []
     km = float(LineGeometry(plan.lines).length_m.sum()) / 1000.0
     polygons = len(plan.area)
     area = {0: "no area", 1: "an area of 1 polygon"}.get(polygons, f"an area of {polygons} polygons")
     lines = "1 line" if len(plan.lines) == 1 else f"{len(plan.lines)} lines"
-    return f"plan {plan.name}: {lines}, {km:.1f} km, {area}", [f"plan.file: {note}" for note in plan.notes]
+    return [f"plan {plan.name}: {lines}, {km:.1f} km, {area}", *plan.notes], []
 
 
 def _listen(config: Config, seconds: float) -> list[Report]:

@@ -136,6 +136,27 @@ def test_a_crs_that_does_not_exist_is_named(tmp_path: Path) -> None:
     )
 
 
+def test_a_flight_plan_is_measured_and_what_was_assumed_is_named(tmp_path: Path) -> None:
+    """One minute of latitude is a nautical mile; the second line's vertices are in one place."""
+    lines = [[[8.0, 47.0, 0.0], [8.0, 47.0 + 1 / 60, 0.0]], [[8.0, 47.0], [8.0, 47.0]]]
+    text = (FIXTURES / "aircraft.toml").read_text().replace("[plan]", '[plan]\nfile = "plan.geojson"')
+    text = text.replace('names = "line"\n', "")
+    for name in ("imu.dbc", "left.toml"):
+        (tmp_path / name).write_bytes((FIXTURES / name).read_bytes())
+    (tmp_path / "swath.toml").write_text(text)
+    told = []
+    for count in (1, 2):
+        shape = {"type": "MultiLineString", "coordinates": lines[:count]}
+        (tmp_path / "plan.geojson").write_text(json.dumps(shape))
+        done = swath("check", "--offline", "--json", str(tmp_path / "swath.toml"))
+        found = json.loads(done.stdout)
+        told.append((done.returncode, found.get("plan"), found["findings"]))
+    unnamed = "plan.geojson: its lines have no names; they are numbered in the order of the file"
+    assert told[0] == (0, ["plan plan.geojson: 1 line, 1.9 km, no area", unnamed], [])
+    broken = "plan.file: plan.geojson: line 1 (feature 1): has no two different vertices; remove it or draw it anew"
+    assert told[1] == (1, None, [broken])
+
+
 def test_run_without_sources_says_so_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "a.toml").write_text('[session]\nname = "x"\ndirectory = "."\nreserve_mb = 1\n')
     run = swath("run", str(tmp_path / "a.toml"), "--seconds", "0.1")
