@@ -98,6 +98,7 @@ def _fill_geotiff(path: Path, reader: TileReader, extent_m: Any, crs: CRS, origi
         "blockxsize": SIDE,
         "blockysize": SIDE,
         "compress": "deflate",
+        "zlevel": 1,
         "predictor": 3,
         "SPARSE_OK": True,
         "BIGTIFF": "IF_SAFER",

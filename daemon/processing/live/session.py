@@ -309,8 +309,10 @@ class Live:
         if self._session is not None:
             self._session.close(live=True)
             self._session.products.save_coverage(self._about())
-            self._session.products.export_coverage()
-        return self._say(f"ended ({self._follower.ended or 'stopped'})")
+        found = self._say(f"ended ({self._follower.ended or 'stopped'})")
+        if self._session is not None:
+            self._session.products.export_coverage()  # last: it takes long on large areas
+        return found
 
 
 def made_session(

@@ -62,6 +62,7 @@ LAYERS = {
 }
 SUMMED = ("points", "pulses", "no_return")
 KEPT_FROM = 4  # cells on a side that one cell of the reader's smallest kept view stands for
+_LEVELS = [KEPT_FROM << k for k in range((SIDE // KEPT_FROM).bit_length())]
 DIRECT_TILES = 64  # tiles whose files one view in full resolution reads at most; more cells are joined instead
 POWERS = [(first, total - first) for total in range(4) for first in range(total, -1, -1)]  # of a placement's terms
 Place = tuple[int, int]  # column and row of a tile, counted from the origin
@@ -373,21 +374,33 @@ class TileReader:
             needed = {*names, "points"} if "height_m" in names and step > 1 else set(names)
             tile = self.tile(place, needed)
             return None if tile is None else joined(tile.layers, step)
-        sequence, generation = self._tiles[place], self.generation
         kept = self._joined.get(place)
-        if kept is None or kept[:2] != (generation, sequence):
-            tile = self.tile(place)
+        now = self.generation, self._tiles[place]
+        levels: dict[int, Layers] = {} if kept is None or kept[:2] != now else kept[2]
+        known = levels.get(KEPT_FROM, {})
+        missing = {name for name in names if name not in known}
+        if missing:
+            tile = self.tile(place, {*missing, "points"} if "height_m" in missing else missing)
             if tile is None:
-                return None if kept is None or kept[0] != generation else kept[2][step]
-            levels = {KEPT_FROM: joined(tile.layers, KEPT_FROM)}
-            while max(levels) < SIDE:
-                levels[2 * max(levels)] = joined(levels[max(levels)], 2)
-            kept = generation, sequence, levels
-            self._joined[place] = kept
+                return _still_good(kept, now[0], step, names)
+            made = joined(tile.layers, KEPT_FROM)
+            for level in _LEVELS:
+                made = made if level == KEPT_FROM else joined(made, 2)
+                levels.setdefault(level, {}).update(made)
+            self._joined[place] = *now, levels
             while len(self._joined) > self._kept:
                 self._joined.popitem(last=False)
         self._joined.move_to_end(place)
-        return kept[2][step]
+        return levels[step]
+
+
+def _still_good(
+    kept: tuple[int, int, dict[int, Layers]] | None, generation: int, step: int, names: tuple[str, ...]
+) -> Layers | None:
+    """Return what was read of a tile before, while it cannot be read anew; None: nothing of this grid."""
+    if kept is None or kept[0] != generation or not set(names) <= set(kept[2][step]):
+        return None
+    return kept[2][step]
 
 
 @dataclass(frozen=True, slots=True)

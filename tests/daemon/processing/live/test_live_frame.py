@@ -67,7 +67,7 @@ class TestFrame:
         told: list[tuple[Any, ...]] = []
         for maps in (Utm(), Utm(FEET, (FOOT_M, FOOT_M, 1.0))):
             (folder := tmp_path / str(len(told))).mkdir()
-            products = LiveProducts(folder, LiveConfig(), maps, 0, "here")
+            products = LiveProducts(folder, LiveConfig(cell_m=1.0), maps, 0, "here")
             products.look_for_room()
             products.begin(trajectory)
             assert products.frame is not None
