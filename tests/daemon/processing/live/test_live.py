@@ -31,6 +31,7 @@ from swath.daemon.processing.live import session as live_module
 from swath.daemon.processing.live.points import POINT_DTYPE
 from swath.daemon.processing.live.session import Live, LiveSession, Told, replay
 from swath.daemon.processing.live.status import LiveStatus, sentence
+from swath.daemon.processing.live.tiles import Layers, TileReader
 from swath.daemon.processing.points.feed import TICK_BYTES, TICK_NS
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.daemon.processing.warm_up import WarmUp
@@ -135,6 +136,17 @@ def follow_growing(flown: Flown, folder: Path, seed: int, monkeypatch: pytest.Mo
     return told
 
 
+def whole_map(folder: Path) -> Layers:
+    """Return all layers of a live run's map."""
+    reader = TileReader(folder)
+    assert reader.refresh()
+    extent_m = reader.extent_m()
+    assert extent_m is not None
+    view = reader.view(*extent_m, reader.cell_m)
+    assert view is not None
+    return view.layers
+
+
 class TestPoints:
     def test_all_returns_are_accounted_for(self, replayed: tuple[Path, Told]) -> None:
         folder, found = replayed
@@ -173,6 +185,10 @@ class TestPoints:
         replay(flown.session(), flown.setup(), tmp_path, LiveConfig(), tmp_path / "points.npy", batches=cut())
         for name in ("points.npy", "coverage.png", "lines.json"):
             assert (tmp_path / name).read_bytes() == (replayed[0] / name).read_bytes(), name
+        ours, theirs = (whole_map(folder) for folder in (tmp_path, replayed[0]))
+        assert ours["points"].sum() > 10_000
+        for name, values in ours.items():
+            np.testing.assert_array_equal(values, theirs[name], err_msg=name)
 
     def test_points_after_skipped_chunks_are_unchanged(
         self, flown: Flown, replayed: tuple[Path, Told], tmp_path: Path
