@@ -46,7 +46,6 @@ class Feed:
     def __init__(self, watch: Watch) -> None:
         self._watch = watch
         self._changed = asyncio.Condition()
-        self._number = 0
         self._loop: asyncio.AbstractEventLoop | None = None
         self.readers = 0
 
@@ -62,22 +61,25 @@ class Feed:
 
     async def _wake(self) -> None:
         async with self._changed:
-            self._number += 1
             self._changed.notify_all()
 
     async def lines(self, role: str) -> AsyncIterator[bytes]:
-        """Yield server-sent events, each with the newest snapshot."""
+        """Yield server-sent events: the role, then the newest snapshot and how to steer when they have changed."""
         self.readers += 1
         try:
             yield f"retry: {RETRY_MS}\nevent: role\ndata: {json.dumps(role)}\n\n".encode()
-            seen = -1
+            shown: tuple[object, object] = (None, None)
             while True:
-                if seen != self._number:
-                    seen = self._number
-                    yield f"data: {json.dumps(self._watch.latest, separators=(',', ':'))}\n\n".encode()
+                latest, steering = self._watch.latest, self._watch.steering
+                if steering is not shown[1]:
+                    yield f"event: steering\ndata: {json.dumps(steering, separators=(',', ':'))}\n\n".encode()
+                if latest is not shown[0]:
+                    yield f"data: {json.dumps(latest, separators=(',', ':'))}\n\n".encode()
+                shown = latest, steering
                 try:
                     async with self._changed:
-                        await asyncio.wait_for(self._changed.wait(), ALIVE_S)
+                        if self._watch.latest is latest and self._watch.steering is steering:
+                            await asyncio.wait_for(self._changed.wait(), ALIVE_S)
                 except TimeoutError:
                     yield b": alive\n\n"
         finally:

@@ -15,12 +15,13 @@ from swath.daemon.console.painting import Painter
 from swath.daemon.monitor.display import DEGRADED, NOT_RECORDING, RECORDING, Monitor, follower_of, news
 
 EVERY_S = 1.0
+STEERING_S = 0.2  # live writes it five times a second
 HISTORY_S = 600
 EVENTS_KEPT = 500
 STALE_S = 5.0  # live writes its status each second
 MOST_BYTES = 1 << 23  # of one of live's files
 WORDS = {RECORDING: "RECORDING", DEGRADED: "DEGRADED", NOT_RECORDING: "NOT RECORDING"}
-LIVE_STATUS, LIVE_LINES = "live.json", "lines.json"
+LIVE_STATUS, LIVE_LINES, LIVE_STEERING = "live.json", "lines.json", "steering.json"
 
 Plain = dict[str, Any]
 
@@ -80,7 +81,7 @@ class Numbered:
 
 
 class Watch(threading.Thread):
-    """Reads once a second; `latest` is the newest snapshot, which is replaced and never changed.
+    """Reads once a second; `latest` is the newest snapshot, `steering` how to steer; both are replaced, never changed.
 
     Args:
         directory: log directory of the recorder.
@@ -93,7 +94,9 @@ class Watch(threading.Thread):
         self.latest: Plain = {}
         self.painter = Painter(live)
         self._follower, self._monitor = follower_of(directory), Monitor(directory)
+        self.steering: Plain = {}
         self._live, self._lines = JsonFile(live / LIVE_STATUS), JsonFile(live / LIVE_LINES)
+        self._steering = JsonFile(live / LIVE_STEERING)
         self.tell = tell
         self._events = Numbered()
         self._session: str | None = None
@@ -102,11 +105,17 @@ class Watch(threading.Thread):
         self._ended = threading.Event()
 
     def run(self) -> None:
-        """Read until `close`."""
-        while not self._ended.is_set():
-            self.read()
-            self.tell()
-            self._ended.wait(EVERY_S)
+        """Read until `close`: all once a second, how to steer as often as live tells it."""
+        next_s = time.monotonic()
+        while not self._ended.wait(STEERING_S):
+            steering = self._steering.content() or {}
+            is_due = time.monotonic() >= next_s
+            if is_due:
+                next_s = time.monotonic() + EVERY_S
+                self.read()
+            if is_due or steering != self.steering:
+                self.steering = steering
+                self.tell()
 
     def close(self) -> None:
         """End the thread."""

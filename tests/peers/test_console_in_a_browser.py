@@ -104,8 +104,8 @@ def write_live(live: Path) -> None:
     steering = {"line": "4", "cross_track_m": -12.0, "height_m": 7.0, "track_error_deg": 1.5, "to_begin_m": -400.0,
                 "to_end_m": 1200.0, "to_begin_s": None, "to_end_s": 24.0, "speed_mps": 50.0, "wanted_speed_mps": 52.0,
                 "bank_deg": 3.0, "bank_limit_deg": 20.0}  # fmt: skip
-    lines = {"lines": [flying, again], "current": "4", "next": "9", "steering": steering}
-    (live / "lines.json").write_text(json.dumps(lines))
+    (live / "lines.json").write_text(json.dumps({"lines": [flying, again], "current": "4", "next": "9"}))
+    (live / "steering.json").write_text(json.dumps({"current": "4", "next": "9", "steering": steering}))
 
 
 def keep_current(live: Path) -> None:

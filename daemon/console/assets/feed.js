@@ -5,6 +5,8 @@ let latest = null;
 let heard = 0;
 let role = "viewer";
 
+const steerers = [];
+
 export const text = (id, value) => {
   const element = document.getElementById(id);
   if (element && element.textContent !== value) element.textContent = value;
@@ -15,10 +17,15 @@ export function listen(listener, { once = false } = {}) {
   if (latest) listener(latest, role);
 }
 
+export const steer = (listener) => steerers.push(listener);
+
 export function begin(onQuiet) {
   const source = new EventSource("/feed");
   source.addEventListener("role", (event) => {
     role = JSON.parse(event.data);
+  });
+  source.addEventListener("steering", (event) => {
+    for (const listener of steerers) listener(JSON.parse(event.data));
   });
   source.onmessage = (event) => {
     latest = JSON.parse(event.data);

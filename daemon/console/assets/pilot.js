@@ -1,6 +1,8 @@
 // The steering bar: large figures of the line that is flown, for a second display.
-import { begin, listen, number, text } from "./feed.js";
+import { begin, listen, number, steer, text } from "./feed.js";
 
+let current = false;
+let told = {};
 const $ = (id) => document.getElementById(id);
 const sign = (value, digits = 0) => (value > 0 ? "+" : "") + number(value, digits);
 const over = (name, is) => document.querySelector(`[data-of="${name}"]`).classList.toggle("over", is);
@@ -11,12 +13,12 @@ function away(m, s) {
   return s === null || s === undefined ? distance : `${distance} ${number(s)} s`;
 }
 
-function show(found) {
-  const now = found.lines.steering;
-  text("pilot-note", found.live_is_current ? "" : "No position: swath live does not run");
-  text("next", found.lines.next ? `next: ${found.lines.next}` : "");
-  if (!now || !found.live_is_current) {
-    text("line", found.live_is_current ? "No line" : "NO POSITION");
+function show() {
+  const now = told.steering;
+  text("pilot-note", current ? "" : "No position: swath live does not run");
+  text("next", told.next ? `next: ${told.next}` : "");
+  if (!now || !current) {
+    text("line", current ? "No line" : "NO POSITION");
     for (const id of ["cross", "height", "track", "begin", "end", "speed", "bank"]) text(id, "–");
     return;
   }
@@ -35,7 +37,14 @@ function show(found) {
   over("height", now.height_limit_m != null && Math.abs(now.height_m) > now.height_limit_m);
 }
 
-listen(show);
+listen((found) => {
+  current = found.live_is_current;
+  show();
+});
+steer((steering) => {
+  told = steering;
+  show();
+});
 begin(() => {
   text("line", "NO POSITION");
   text("pilot-note", "The console does not answer");
