@@ -108,7 +108,7 @@ def test_every_stream_is_recorded_and_read_over_every_wire(tmp_path: Path) -> No
         for driver in STREAMS:
             for wire in STREAM_TRANSPORTS:
                 name = f"{driver.protocol}-{wire}"
-                text, send = stack.enter_context(sending_end(wire, tmp_path, name))
+                text, send = stack.enter_context(sending_end(wire, tmp_path, f"{driver.kind}-{name}"))
                 config += f'[{driver.kind}.{name}]\ntransport = "{text}"\nprotocol = "{driver.protocol}"\n'
                 if driver.kind == "imu" and driver.protocol in RECEIVERS_INSIDE:
                     config += f'[gnss.in-{name}]\ntransport = "imu:{name}"\nprotocol = "{driver.protocol}"\n'
@@ -129,7 +129,7 @@ def test_every_stream_is_recorded_and_read_over_every_wire(tmp_path: Path) -> No
             assert {len(unit) for _, unit in content.units[source][:-1]} == {PIECE_BYTES}
         whole, cut = (stored_parsers(session.attachments())[0][source] for _ in range(2))
         expected, found = Heard(), Heard()
-        expected.add(whole.feed(Chunk(source, 0, data)))
+        expected.add(whole.feed(Chunk(source, content.units[source][0][0], data)))
         for time_ns, unit in content.units[source]:
             found.add(cut.feed(Chunk(source, time_ns, unit)))
         assert whole.counters.messages.total() > 0, source
@@ -140,7 +140,9 @@ def test_every_stream_is_recorded_and_read_over_every_wire(tmp_path: Path) -> No
             for time_ns, unit in content.units[source]:
                 inside.add(receiver.feed(Chunk(source, time_ns, unit)))
             kinds = {kind.__name__ for kind in RECEIVER_RECORDS}
-            assert inside.counts == {kind: count for kind, count in found.counts.items() if kind in kinds}, source
+            told = {kind: count for kind, count in found.counts.items() if kind in kinds}
+            # of protocol `records`, a parser gives the records of its own kind of device alone
+            assert told == ({} if source.startswith("imu/records-") else inside.counts), source
             heard_inside += inside.counts
     assert heard_inside["TimeMessage"] > 0
     assert heard_inside["GnssFix"] > 0
