@@ -109,11 +109,12 @@ BY_NAME = (  # compiled loops, bags of ROS
 
 
 def wants_an_extra(name: str) -> bool:
-    """Return True if a module imports what only an extra brings: these, virtual aircraft, processing."""
+    """Return True if a module imports what only an extra brings: these, virtual aircraft, processing, console."""
     _, package, module = [*name.split(".", 2), ""][:3]
     if package == "georef":
         return bool(module) and module.split(".")[0] not in ("records", "timescales")
-    return name in BY_NAME or name.startswith(("swath.sim.", "swath.calib.", "swath.daemon.processing."))
+    needs = ("swath.sim.", "swath.calib.", "swath.daemon.processing.", "swath.daemon.console.")
+    return name in BY_NAME or name.startswith(needs)
 
 
 def test_bare_install_has_every_module_of_the_project(installed: Path) -> None:

@@ -224,6 +224,7 @@ def _warm_frame(points: Points, trajectory: Trajectory | None, mapping: Maps | N
         made.take(points, frame)
         made.end()
         trajectory.between(int(trajectory.time_ns[-1]), int(trajectory.time_ns[-1])).velocity_l()
+        trajectory.poses(list(trajectory.span))
 
 
 def _warm_products(points: Points) -> None:
