@@ -101,7 +101,9 @@ def test_bare_install_imports_all_packages_and_no_processing_module(installed: P
     assert (done.returncode, done.stdout.strip()) == (0, "[]"), done.stderr
 
 
-BY_NAME = (  # compiled loops, bags of ROS
+TABLES = "swath.drivers.captures.tables."
+BY_NAME = (  # compiled loops, bags of ROS, MF4
+    "swath.drivers.captures.can.mf4",
     "swath.drivers.captures.rosbag.bag",
     "swath.drivers.captures.rosbag.unfinished",
     "swath.drivers.scanner.rows.compiled",
@@ -113,7 +115,7 @@ def wants_an_extra(name: str) -> bool:
     _, package, module = [*name.split(".", 2), ""][:3]
     if package == "georef":
         return bool(module) and module.split(".")[0] not in ("records", "timescales")
-    needs = ("swath.sim.", "swath.calib.", "swath.daemon.processing.", "swath.daemon.console.")
+    needs = ("swath.sim.", "swath.calib.", "swath.daemon.processing.", "swath.daemon.console.", TABLES)
     return name in BY_NAME or name.startswith(needs)
 
 

@@ -172,7 +172,7 @@ def test_worker_processes_and_compiling_end_at_a_real_ctrl_c(flown: Flown, tmp_p
         assert process.stderr is not None
         assert process.stderr.readline() == f"{COMPILING}\n"
         wait_until(lambda: (tmp_path / "out").exists(), "the second pass")
-        time.sleep(1.0)
+        time.sleep(0.2)
         os.killpg(process.pid, signal.SIGINT)
         rest = process.stderr.read()
         assert process.wait(HANGS_S) == INTERRUPTED
