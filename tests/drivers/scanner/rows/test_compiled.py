@@ -37,8 +37,13 @@ def parser_of(driver: Driver, settings: DeviceSettings) -> PacketParser | None:
     return parser
 
 
-def row_bytes(records: list[Record]) -> list[bytes]:
-    return [record.rows.tobytes() for record in records if isinstance(record, ScannerReturns)]
+def bytes_of(rows: StructArray) -> list[bytes]:
+    """Return the bytes of each column: a row's own also hold what lies between its fields, which means nothing."""
+    return [rows[name].tobytes() for name in rows.dtype.names or ()]
+
+
+def row_bytes(records: list[Record]) -> list[list[bytes]]:
+    return [bytes_of(record.rows) for record in records if isinstance(record, ScannerReturns)]
 
 
 @pytest.mark.parametrize("protocol", sorted(set(SCANNERS) - NO_RECORDING))
@@ -55,7 +60,7 @@ def test_compiled_and_plain_code_give_the_same_rows_of_recordings(protocol: str)
             rows = row_bytes(feed(plain, units[:600]))
             assert row_bytes(feed(compiled, units[:600])) == rows
             assert compiled.counters == plain.counters
-            seen += sum(map(len, rows))
+            seen += len(rows)
     assert seen > 0
 
 
@@ -72,7 +77,7 @@ def test_compiled_and_plain_code_give_the_same_rows_for_any_number_of_slots(slot
         widths = random.integers(0, 65536, (50, slots))
         units.append(encode_datagram(header, np.arange(50) * 50, encoder, ranges, widths[::-1], widths))
     rows = row_bytes(feed(SrepParser(settings), units))
-    assert len(rows[0]) > 0
+    assert len(rows[0][0]) > 0
     assert row_bytes(feed(SrepParser(replace(settings, compiled=True)), units)) == rows
 
 
