@@ -15,7 +15,7 @@ from pathlib import Path
 
 from swath.drivers.can_frames import CAN_EFF_FLAG, CANFD_BRS, CANFD_ESI, CANFD_LENGTHS, data_frame
 from swath.drivers.captures.base import LATEST_NS, CapturedUnit, CaptureTally, read_lines, report, until_damage
-from swath.drivers.captures.can.clock import FileClock, FileTime, decimal_ns
+from swath.drivers.captures.can.clock import FileClock, FileTime, decimal_ns, local_time
 
 _DATE = re.compile(
     r"(?:date|begin\s+trigger\s?block)\s+\S+\s+(\S+)\s+(\d{1,2})\s+(\d{1,2}):(\d\d):(\d\d)(?:[.:](\d{1,9}))?"
@@ -76,7 +76,7 @@ def _local(line: str) -> dt.datetime | None:
     hours = int(hour) % 12 + 12 * (half.upper() == "P") if half else int(hour)
     microseconds = int((fraction or "").ljust(6, "0")[:6])
     try:
-        return dt.datetime(int(year), month or 0, int(day), hours, int(minute), int(second), microseconds)  # noqa: DTZ001
+        return local_time(int(year), month or 0, int(day), hours, int(minute), int(second), microseconds)
     except ValueError:
         return None
 

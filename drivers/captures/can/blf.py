@@ -24,7 +24,7 @@ from swath.drivers.captures.base import (
     report,
     until_damage,
 )
-from swath.drivers.captures.can.clock import FileClock, FileTime
+from swath.drivers.captures.can.clock import FileClock, FileTime, local_time
 from swath.drivers.transports.base import TransportError
 
 MAGIC = b"LOGG"
@@ -80,7 +80,7 @@ def _header(stream: BufferedIOBase, path: Path) -> tuple[int, ...]:
 def _began(header: tuple[int, ...]) -> dt.datetime | None:
     year, month, _, day, hour, minute, second, ms = header[2:]
     try:
-        return dt.datetime(year, month, day, hour, minute, second, ms * 1000)  # noqa: DTZ001
+        return local_time(year, month, day, hour, minute, second, ms * 1000)
     except ValueError:
         return None
 

@@ -5,7 +5,6 @@ The forms follow can-utils' lib.c (`parse_canframe`, `snprintf_long_canframe`) a
 
 from __future__ import annotations
 
-import datetime as dt
 import re
 import struct
 from collections.abc import Iterator
@@ -34,7 +33,7 @@ from swath.drivers.captures.base import (
     report,
     until_damage,
 )
-from swath.drivers.captures.can.clock import FileClock, FileTime, decimal_ns
+from swath.drivers.captures.can.clock import FileClock, FileTime, decimal_ns, local_time
 from swath.drivers.transports.base import TransportError
 
 _Shown = tuple[str, str, bytes | None]  # stamp, interface, frame
@@ -133,13 +132,12 @@ class _Stamps:
     def _local(self, text: str) -> int | None:
         date = _DATE.fullmatch(text)
         try:
-            return None if date is None else self._clock.unix_ns(_date(date)) + int(date[7].ljust(9, "0"))
+            if date is None:
+                return None
+            second = local_time(*map(int, date.groups()[:6]))
+            return self._clock.unix_ns(second) + int(date[7].ljust(9, "0"))
         except (ValueError, OverflowError):
             return None
-
-
-def _date(match: re.Match[str]) -> dt.datetime:
-    return dt.datetime(*map(int, match.groups()[:6]))  # type: ignore[arg-type]  # noqa: DTZ001
 
 
 def _decreases(stamps: list[str]) -> bool:

@@ -13,6 +13,17 @@ _UNIX = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
 _MICROSECOND = dt.timedelta(microseconds=1)
 
 
+def local_time(
+    year: int, month: int, day: int, hour: int = 0, minute: int = 0, second: int = 0, microsecond: int = 0
+) -> dt.datetime:
+    """Return a local time without a zone, which `FileClock` gives it.
+
+    Raises:
+        ValueError: there is no such time.
+    """
+    return dt.datetime(year, month, day, hour, minute, second, microsecond)  # noqa: DTZ001  (the file names no zone)
+
+
 class FileTime(Enum):
     """The times that a file tells."""
 
@@ -24,7 +35,7 @@ class FileTime(Enum):
 
 @dataclass(frozen=True, slots=True)
 class FileClock:
-    """What the user knows of a file's times.
+    """Holds what the user knows of a file's times.
 
     Attributes:
         start_ns: the time at which the file's own times are 0, nanoseconds since 1970; None: as the file tells.

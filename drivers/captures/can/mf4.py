@@ -29,14 +29,14 @@ from swath.drivers.captures.base import (
     report,
     until_damage,
 )
-from swath.drivers.captures.can.clock import FileClock, FileTime
+from swath.drivers.captures.can.clock import FileClock, FileTime, local_time
 from swath.drivers.transports.base import TransportError
 from swath.georef.arrays import FloatArray
 
 _DATA, _REMOTE, _ERROR = "CAN_DataFrame", "CAN_RemoteFrame", "CAN_ErrorFrame"
 _RECORDS_A_READ = 20_000
 _IS_LOCAL = 0x01  # time flags of the header: the start is a local time without a zone
-_UNIX = dt.datetime(1970, 1, 1)  # noqa: DTZ001
+_UNIX = local_time(1970, 1, 1)
 
 
 def mf4_time(path: Path) -> FileTime:

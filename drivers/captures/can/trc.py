@@ -22,9 +22,9 @@ from swath.drivers.captures.base import (
     report,
     until_damage,
 )
-from swath.drivers.captures.can.clock import FileClock, FileTime, decimal_ns
+from swath.drivers.captures.can.clock import FileClock, FileTime, decimal_ns, local_time
 
-_DAY_ZERO = dt.datetime(1899, 12, 30)  # noqa: DTZ001 - of the start time, a local one
+_DAY_ZERO = local_time(1899, 12, 30)  # of the start time
 _DAY_NS, _MS_NS = 86_400_000_000_000, 1_000_000
 _KEY = re.compile(r";\$(FILEVERSION|STARTTIME|COLUMNS)\s*=\s*(\S+)", re.IGNORECASE)
 _START = re.compile(
@@ -96,7 +96,7 @@ class _Head:
             day, month, year, hour, minute, second = map(int, start.groups()[:6])
             fraction = start[7].ljust(3, "0") + (start[8] or "").ljust(3, "0")
             try:
-                self.began = dt.datetime(year, month, day, hour, minute, second, int(fraction))  # noqa: DTZ001
+                self.began = local_time(year, month, day, hour, minute, second, int(fraction))
             except ValueError:
                 return
 

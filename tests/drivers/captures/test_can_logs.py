@@ -169,7 +169,7 @@ class TestCandump:
     def test_every_form_of_time_is_read(
         self, tmp_path: Path, stamps: list[str], told: FileTime, wanted_ns: list[int]
     ) -> None:
-        """Of -t a, of it with -N, of -t A, -t z and -t d, in both kinds of lines."""
+        """Read -t a, with and without -N, -t A, -t z and -t d, in both kinds of lines."""
         clock = FileClock(START_NS if told is FileTime.SINCE_BEGIN else None, BERNE)
         for form in ("({}) can0 123#00", " ({})  can0  123   [1]  00"):
             text = "".join(form.format(stamp) + "\n" for stamp in stamps)
