@@ -8,13 +8,17 @@ import sys
 import tempfile
 import uuid
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.directory import DEFAULT_CONFIG, log_directory
 from swath.daemon.processing.requirements import require_installed
+
+if TYPE_CHECKING:
+    from swath.daemon.config.listen import Place
+    from swath.daemon.config.tables import ConsoleConfig
 
 PAIR = "pair"
 
@@ -45,7 +49,7 @@ def command(
     """
     require_installed("swath console", "starlette", "uvicorn", "xstatic", "cryptography", "segno")
     from swath.daemon.config.tables import ConsoleConfig
-    from swath.daemon.console.serve import pairing_text, parse_listen, serve
+    from swath.daemon.console.serve import pairing_text, serve
     from swath.daemon.processing.live.session import FOLDER
 
     words = list(where or [])
@@ -63,7 +67,7 @@ def command(
         from swath.daemon.config import load_config
 
         config = load_config(path).tables.console
-    place = parse_listen(listen or config.listen)
+    place = _place(listen, config)
     if pairs:
         print(pairing_text(place, config, viewer=viewer))
         return
@@ -72,20 +76,31 @@ def command(
     serve(directory, directory / FOLDER, config, place)
 
 
+def _place(listen: str | None, config: ConsoleConfig) -> Place:
+    from swath.daemon.config.listen import parse_listen
+
+    try:
+        return parse_listen(config.listen if listen is None else listen)
+    except ValueError as error:
+        raise UserError(f"--listen: {error}", ExitCode.USAGE) from error
+
+
 def _replay(paths: list[Path], listen: str | None, pace: float) -> None:
     """Let logs grow again in a temporary folder, beside `swath live`, and serve that."""
     from swath.daemon.config.tables import ConsoleConfig
     from swath.daemon.console.replaying import GrowingCopy
-    from swath.daemon.console.serve import parse_listen, serve
+    from swath.daemon.console.serve import serve
     from swath.daemon.console.watch import LIVE_STATUS
     from swath.daemon.log.reader import open_logs
     from swath.daemon.processing.live.session import FOLDER
+    from swath.daemon.processing.user_errors import as_user_error
 
     if not paths:
         raise UserError("--replay needs logs: swath console --replay LOG…", ExitCode.USAGE)
     config = ConsoleConfig()
-    place = parse_listen(listen or config.listen)
-    sessions = open_logs(paths)
+    place = _place(listen, config)
+    with as_user_error(paths[0]):
+        sessions = open_logs(paths)
     if len(sessions) > 1:
         names = ", ".join(session.session_id for session in sessions)
         raise UserError(f"these are {len(sessions)} recordings, and one is shown at a time: {names}", ExitCode.USAGE)

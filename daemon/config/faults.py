@@ -77,8 +77,7 @@ def _wanted(kind: str, context: Mapping[str, Any], field: FieldInfo | None) -> s
     if kind in ("too_short", "too_long") and kind == "too_short" and context.get("min_length") == 1:
         return "at least one"
     if kind in ("too_short", "too_long"):
-        # lists of numbers and of names have a fixed length, lists of tables a maximum
-        at_most = "at most " if kind == "too_long" and field is not None and _model_in(field.annotation) else ""
+        at_most = "at most " if kind == "too_long" and field is not None and not _has_fixed_length(field) else ""
         return f"{at_most}{context.get('min_length', context.get('max_length'))} values"
     if kind == "string_too_long":
         return f"at most {context['max_length']} characters"
@@ -93,6 +92,13 @@ def _wanted(kind: str, context: Mapping[str, Any], field: FieldInfo | None) -> s
     wanted = _TYPE_WANTED.get(kind, kind)
     bounds = _bounds(field) if kind in ("float_type", "int_type") else ""
     return f"{wanted} {bounds}".rstrip()
+
+
+def _has_fixed_length(field: FieldInfo) -> bool:
+    """Return whether a list has one length, as a vector; lists of tables and of texts have a largest one."""
+    has_most = any(getattr(item, "max_length", None) is not None for item in field.metadata)
+    has_least = any(getattr(item, "min_length", None) is not None for item in field.metadata)
+    return _model_in(field.annotation) is None and has_most == has_least
 
 
 def _wanted_of_pattern(pattern: str) -> str:

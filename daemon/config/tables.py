@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
+from swath.daemon.config.listen import listen_text
 from swath.daemon.config.rotations import angles_of_prisms, with_matrix, within_a_turn
 
 NAME_PATTERN = r"^[A-Za-z0-9_-]+$"
@@ -559,9 +560,8 @@ class LiveConfig(Section):
 class ConsoleConfig(Section):
     """``[console]``: the operator's pages, served by `swath console`."""
 
-    listen: str = Field(
+    listen: Annotated[str, AfterValidator(listen_text)] = Field(
         "127.0.0.1:8470",
-        pattern=r"^(\[[0-9a-fA-F:.]+\]|[0-9.]+):[0-9]{1,5}$",
         description="address and port; beyond this computer (not 127.0.0.1 or [::1]) tokens and TLS are needed",
     )
     names: list[str] = Field(

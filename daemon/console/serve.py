@@ -10,7 +10,6 @@ import ipaddress
 import os
 import socket
 import ssl
-from dataclasses import dataclass
 from pathlib import Path
 
 import psutil
@@ -21,6 +20,7 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from swath.daemon.config.listen import Place
 from swath.daemon.config.tables import ConsoleConfig
 from swath.daemon.console.access import OPERATOR, VIEWER, Access, read_tokens
 from swath.daemon.console.app import make_app
@@ -32,54 +32,17 @@ CONNECTIONS = 300  # at once; more are refused
 SILENT_S = 10.0  # a connection that has not asked by then is closed
 KEY, CERTIFICATE = "key.pem", "certificate.pem"
 CERTIFICATE_DAYS = 3650
+SERVICE_STATE = Path("/var/lib/swath-console")  # of swath-console.service
 _LOCAL = ("localhost", "127.0.0.1", "::1", "0.0.0.0", "::")
 
 
-@dataclass(frozen=True, slots=True)
-class Place:
-    """Where the console listens."""
-
-    address: str
-    port: int
-
-    @property
-    def is_local(self) -> bool:
-        """True if only this computer reaches it."""
-        return ipaddress.ip_address(self.address).is_loopback
-
-    @property
-    def host(self) -> str:
-        """The address as a URL writes it."""
-        return f"[{self.address}]" if ":" in self.address else self.address
-
-    @property
-    def url(self) -> str:
-        """The first page's address, on this computer."""
-        return f"http{'' if self.is_local else 's'}://{self.host}:{self.port}/"
-
-
-def parse_listen(text: str) -> Place:
-    """Return address and port of ``ADDRESS:PORT``.
-
-    Raises:
-        UserError: it is neither; a name is none, because it may lead anywhere.
-    """
-    address, _, port = text.rpartition(":")
-    try:
-        place = Place(str(ipaddress.ip_address(address.strip("[]"))), int(port))
-    except ValueError:
-        place = Place("", 0)
-    if not 1 <= place.port <= 65535:
-        text = f"--listen {text}: want an address of this computer and a port, such as 127.0.0.1:8470 or 0.0.0.0:8470"
-        raise UserError(text, ExitCode.USAGE)
-    return place
-
-
 def state_folder() -> Path:
-    """Return the folder for tokens and certificate: systemd's for the service, else the user's."""
-    of_service = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
-    if of_service:
-        return Path(of_service)
+    """Return the folder for tokens and certificate: the service's for its user, else the user's own."""
+    of_unit = os.environ.get("STATE_DIRECTORY", "").partition(":")[0]
+    if of_unit:
+        return Path(of_unit)
+    if SERVICE_STATE.is_dir() and SERVICE_STATE.stat().st_uid == os.geteuid():
+        return SERVICE_STATE
     base = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local/state")
     return Path(base) / "swath-console"
 
@@ -173,7 +136,8 @@ def pairing_text(place: Place, config: ConsoleConfig, *, viewer: bool) -> str:
 class _Protocol(H11Protocol):
     """HTTP of a client that has to ask within `SILENT_S`; uvicorn itself waits for ever for the first request."""
 
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
         super().connection_made(transport)
         asyncio.get_running_loop().call_later(SILENT_S, self._close_if_silent)
 
@@ -191,14 +155,14 @@ def serve(directory: Path, live: Path, config: ConsoleConfig, place: Place, *, a
     manager = ServiceManager()
     names = names_of(place, config)
     tokens: dict[str, str] = {}
-    tls: dict[str, str] = {}
+    key: Path | None = None
+    chain: Path | None = None
     if not place.is_local:
         folder = state_folder()
         tokens = read_tokens(folder)
         key, chain = certificate(folder, names)
-        tls = {"ssl_keyfile": str(key), "ssl_certfile": str(chain)}
     watch = Watch(directory, live)
-    app, feed = make_app(watch, Access(tokens), directory if asks else None, config, names, secure=bool(tls))
+    app, feed = make_app(watch, Access(tokens), directory if asks else None, config, names, secure=not place.is_local)
     sock = _bound(place)
     settings = uvicorn.Config(
         app,
@@ -212,8 +176,8 @@ def serve(directory: Path, live: Path, config: ConsoleConfig, place: Place, *, a
         timeout_graceful_shutdown=2,
         h11_max_incomplete_event_size=16_384,
         backlog=128,
-        ssl_version=ssl.PROTOCOL_TLS_SERVER,
-        **tls,  # type: ignore[arg-type]
+        ssl_keyfile=key,
+        ssl_certfile=chain,
     )
     watch.tell = feed.tell
     watch.read()

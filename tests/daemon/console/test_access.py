@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from swath.daemon.console import serve
 from swath.daemon.console.access import (
     FAILURES,
     IDLE_S,
@@ -47,6 +48,18 @@ def test_a_file_without_tokens_is_refused_with_the_remedy(tmp_path: Path, conten
     path.chmod(0o600)
     with pytest.raises(UserError, match="new ones are made"):
         read_tokens(tmp_path)
+
+
+def test_the_service_and_its_user_have_one_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The user of the service pairs outside its unit, where systemd names no folder."""
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "home"))
+    monkeypatch.setattr(serve, "SERVICE_STATE", tmp_path / "service")
+    assert serve.state_folder() == tmp_path / "home/swath-console"
+    (tmp_path / "service").mkdir()
+    assert serve.state_folder() == tmp_path / "service"
+    monkeypatch.setenv("STATE_DIRECTORY", "/of/the/unit")
+    assert serve.state_folder() == Path("/of/the/unit")
 
 
 def test_sessions_have_the_role_of_their_token_and_end() -> None:

@@ -5,11 +5,14 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
+import pytest
+
 from swath.daemon.console.replaying import GrowingCopy
 from swath.daemon.log.claim import is_being_written
 from swath.daemon.log.parts import read_sign
 from swath.daemon.log.reader import open_logs
 from tests.daemon.builders import INFO, write_part
+from tests.daemon.commands import swath
 from tests.daemon.rig import wait_until
 
 
@@ -51,3 +54,12 @@ def test_a_copy_that_is_closed_ends_at_once(tmp_path: Path) -> None:
     wait_until(lambda: read_sign(folder) is not None, "the sign of a recording")
     growing.close()
     assert not growing.is_alive()
+
+
+@pytest.mark.parametrize(("name", "words"), [("nothing.mcap", "no such file"), ("text.mcap", "is not an MCAP file")])
+def test_a_log_that_is_none_is_refused_in_one_line(tmp_path: Path, name: str, words: str) -> None:
+    (tmp_path / "text.mcap").write_text("no log")
+    run = swath("console", "--replay", str(tmp_path / name))
+    assert run.returncode == 3
+    assert words in run.stderr
+    assert run.stderr.count("\n") == 1
