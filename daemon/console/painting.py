@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import struct
 import threading
-import zlib
 from collections import OrderedDict
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -15,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.daemon.png import png
 from swath.daemon.processing.live.tiles import Placement, TileReader, View
 
 PIXELS = 256
@@ -27,6 +26,7 @@ DIFFERENCE_M = 0.15
 AGE_S = 1800.0
 DENSITIES = (0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)  # points per m²
 LIGHT = np.array([-0.5, 0.5, 0.7071]) / np.linalg.norm([-0.5, 0.5, 0.7071])  # from north-west, half way up
+DARKEST, BRIGHTEST = 0.45, 1.15  # of the brightness of level ground; beyond these the ramp's colours cannot be told
 OVERVIEW = 400  # cells of the view that the range of heights is taken from
 
 # Ramps whose lightness rises steadily, so that they order the values for the colour-blind too.
@@ -248,15 +248,18 @@ def coloured(ramp: str, part: NDArray[Any]) -> Picture:
 
 
 def shade(height_m: NDArray[Any], cell_m: float) -> NDArray[np.float64]:
-    """Return the light on a surface, 0.45 to 1, full on level ground; rows from north to south."""
+    """Return how bright a surface is, up to 1, of heights whose rows run from north to south.
+
+    The light stands where it does in the quick look, which shades by Matplotlib; the console starts without that.
+    """
     filled = np.where(np.isfinite(height_m), height_m, 0.0)
     south, east = np.gradient(filled, cell_m)
     known = np.isfinite(height_m)
     known[1:-1, 1:-1] &= known[:-2, 1:-1] & known[2:, 1:-1] & known[1:-1, :-2] & known[1:-1, 2:]
     normal = np.stack([-east, south, np.ones_like(east)], axis=-1)
     normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
-    light = np.clip((normal @ LIGHT) / LIGHT[2], 0.45, 1.15) / 1.15 * 1.0
-    return np.where(known, light, 1.0 / 1.15)
+    of_level = np.clip((normal @ LIGHT) / LIGHT[2], DARKEST, BRIGHTEST)
+    return np.where(known, of_level, 1.0) / BRIGHTEST
 
 
 def gaps(covered: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
@@ -270,15 +273,3 @@ def _between(covered: NDArray[np.bool_], reach: int) -> NDArray[np.bool_]:
     before = np.maximum.accumulate(np.where(covered, number, -far), axis=1)
     after = np.minimum.accumulate(np.where(covered, number, far)[:, ::-1], axis=1)[:, ::-1]
     return np.asarray(after - before - 1 <= reach)
-
-
-def png(image: Picture) -> bytes:
-    """Return RGBA (rows, columns, 4) as PNG (ISO/IEC 15948)."""
-    rows, columns, _ = image.shape
-    lines = np.zeros((rows, 1 + 4 * columns), np.uint8)  # each line begins with the number of its filter: 0
-    lines[:, 1:] = image.reshape(rows, -1)
-    head = struct.pack(">IIBBBBB", columns, rows, 8, 6, 0, 0, 0)
-    pieces = ((b"IHDR", head), (b"IDAT", zlib.compress(lines.tobytes(), 1)), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in pieces
-    )

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import struct
-import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.daemon.png import png
 from swath.daemon.processing.live.frame import LocalFrame
 from swath.daemon.processing.live.grid import CellGrid
 from swath.daemon.processing.live.strips import StripComparison, StripCutter
@@ -156,19 +155,10 @@ class LiveMap:
 
 
 def picture(counts: NDArray[Any], cell_m: float) -> bytes:
-    """Return a PNG (ISO/IEC 15948) of cells (rows, columns), one pixel each, coloured by density;
+    """Return a PNG of cells (rows, columns), one pixel each, coloured by density;
     empty ones are clear.
     """
     index: ByteArray = np.zeros(counts.shape, dtype=np.uint8)
     for density, _ in COLOURS:
         index += counts >= max(1, math.ceil(density * cell_m**2))
-    rows, columns = index.shape
-    lines = np.zeros((rows, columns + 1), dtype=np.uint8)  # each line begins with the number of its filter: 0
-    lines[:, 1:] = index
-    palette = b"".join(colour.to_bytes(3, "big") for colour in (0, *(colour for _, colour in COLOURS)))
-    head = struct.pack(">IIBBBBB", columns, rows, 8, 3, 0, 0, 0)
-    pieces = {b"IHDR": head, b"PLTE": palette, b"tRNS": b"\0", b"IDAT": zlib.compress(lines.tobytes(), 1), b"IEND": b""}
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-        for kind, data in pieces.items()
-    )
+    return png(index, [0, *(colour for _, colour in COLOURS)])
