@@ -23,6 +23,7 @@ from swath.daemon.processing.quicklook.strips import (
     MOMENTS,
     RETURNS_A_CELL,
     TILE,
+    add_moments,
     merged,
     open_density,
     planes_of,
@@ -483,14 +484,5 @@ def _sum_moments(
         x, y = x_m - (across + 0.5) * cell_m, y_m - (up + 0.5) * cell_m
         if return_number[i] <= 1:
             cell[0] += 1.0
-        cell[1] += 1.0
-        cell[2] += x
-        cell[3] += y
-        cell[4] += z
-        cell[5] += x * x
-        cell[6] += x * y
-        cell[7] += y * y
-        cell[8] += x * z
-        cell[9] += y * z
-        cell[10] += z * z
+        add_moments(cell, x, y, z)
     return len(xyz)

@@ -21,7 +21,7 @@ from swath.calib.strips.differences import single_return_sigma_m
 from swath.daemon.processing.quicklook.grids import Frame, inner, smoothed
 from swath.daemon.processing.quicklook.read import Block
 from swath.georef.arrays import BoolArray, FloatArray, Int64Array, SingleArray
-from swath.georef.compiled import jit_cached
+from swath.georef.compiled import jit_cached, jit_inline
 
 TILE = 16  # cells along a side; memory is allocated by tiles
 TILE_CELLS = TILE * TILE
@@ -49,6 +49,21 @@ PULSES_TO_COVER = 6.0
 NARROWEST = 0.125  # of a cell: the smallest spread (one sigma) of a strip's returns in it, in any direction
 HISTOGRAM_STEP_M, HISTOGRAM_HALF = 0.001, 10_000
 SHOWN_SIGMA_M = 0.0025  # sigma of a difference on maps: an eighth of their first class, 2 cm
+
+
+@jit_inline
+def add_moments(cell: Any, x: float, y: float, z: float) -> None:
+    """Add a single return, in metres from its cell's middle, to the cell's moments (`MOMENTS`,)."""
+    cell[1] += 1.0
+    cell[2] += x
+    cell[3] += y
+    cell[4] += z
+    cell[5] += x * x
+    cell[6] += x * y
+    cell[7] += y * y
+    cell[8] += x * z
+    cell[9] += y * z
+    cell[10] += z * z
 
 
 @jit_cached
@@ -89,16 +104,7 @@ def _sum_moments(
         if single[i]:
             x, y = x_m[i] - west_m - (across + 0.5) * cell_m, y_m[i] - south_m - (up + 0.5) * cell_m
             z = z_m[i] - reference_m
-            cell[1] += 1.0
-            cell[2] += x
-            cell[3] += y
-            cell[4] += z
-            cell[5] += x * x
-            cell[6] += x * y
-            cell[7] += y * y
-            cell[8] += x * z
-            cell[9] += y * z
-            cell[10] += z * z
+            add_moments(cell, x, y, z)
     return len(x_m), used, outside
 
 
