@@ -40,7 +40,7 @@ NO_ARRIVAL = 2  # flag: the unit's host time is the rows' own time, not that of 
 
 
 class Scale(IntEnum):
-    """What the times of rows count from, in nanoseconds."""
+    """Names what the times of rows, in nanoseconds, count from."""
 
     GPS = 0  # 1980-01-06, GPS time
     UTC = 1  # 1970-01-01 without leap seconds (POSIX)

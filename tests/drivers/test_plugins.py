@@ -415,7 +415,7 @@ def _members(thing: Any) -> Iterator[str]:
 
 
 def test_the_interface_is_that_of_its_number() -> None:
-    """What is written down holds until `INTERFACE` gets another number; new names and fields are added to the file."""
+    """Hold what the file says until `INTERFACE` gets another number; new names and fields are added to the file."""
     assert SNAPSHOT.name == f"interface-{swath.drivers.interface.INTERFACE}.txt"
     now, then = interface_lines(), SNAPSHOT.read_text().splitlines()
     gone = [line for line in then if line not in now]

@@ -268,7 +268,7 @@ class Column:
 
 @dataclass(slots=True)
 class Plan:
-    """What of a table is read.
+    """Says what of a table is read.
 
     Attributes:
         kinds: of rows, with their columns by quantity.

@@ -106,7 +106,7 @@ def test_a_late_segment_is_stamped_when_it_could_be_read(tmp_path: Path) -> None
 
 
 def test_bytes_that_the_receiver_has_but_not_the_capture_are_a_gap(tmp_path: Path) -> None:
-    """What follows a gap was read when it came: it keeps its stamps. The gap ends when it is acknowledged for 0.1 s."""
+    """Keep the stamps of what follows a gap, which was read when it came; an acknowledgement ends it after 0.1 s."""
     frames = [
         (0, from_device(99, flags=SYN)), (1, from_device(100, b"abc")), (2, from_device(110, b"def")),
         (3, from_device(120, b"ghi")), (4, acknowledging(103)), (5, acknowledging(123)), (60, from_device(123, b"jkl")),

@@ -89,9 +89,7 @@ def test_what_cannot_be_exported_is_said(tmp_path: Path, monkeypatch: pytest.Mon
 
 @pytest.mark.slow
 def test_painted_cells_are_those_of_the_truth(tmp_path: Path) -> None:
-    """Where echoes came from is known of a virtual flight, and PROJ maps it. Its end, for which the log has no pose any
-    more, is left out.
-    """
+    """Map the true places of the echoes by PROJ, without the flight's end, for which the log has no pose any more."""
     plan = tmp_path / "plan.toml"
     plan.write_text(PLAN.replace("prf_hz = 5000", "prf_hz = 30000"))
     log, out = tmp_path / "log", tmp_path / "out"
