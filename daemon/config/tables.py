@@ -515,6 +515,9 @@ class PlanWantedConfig(Section):
     fix: Literal["auto", "any", "float", "fixed"] = Field(
         "auto", description="least quality of the receivers' positions; auto: fixed as soon as one was, before that any"
     )
+    quality_level: Literal["QL0", "QL1", "QL2", "QL3"] | None = Field(
+        None, description="USGS quality level whose RMSDz overlapping strips have to keep; shown, no line's verdict"
+    )
 
 
 class PlanConfig(Section):

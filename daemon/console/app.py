@@ -108,6 +108,7 @@ class Pages:
             Route("/history", self.history),
             Route("/about", self.about),
             Route("/tiles/{layer}/{square:path}", self.tile),
+            Route("/look/{name}", self.look),
             Route("/mark", self.mark, methods=["POST"]),
             Route("/split", self.split, methods=["POST"]),
             Route("/session", self.begin_session, methods=["POST"]),
@@ -152,6 +153,16 @@ class Pages:
             return _missing()
         picture = await run_in_threadpool(self._watch.painter.picture, layer, *place)
         return Response(picture, media_type="image/png", headers={"cache-control": "no-cache"})
+
+    async def look(self, request: Request) -> Response:
+        """Return the profile or the last minute's points, unless the page has them already."""
+        file = self._watch.looks.get(request.path_params["name"])
+        if file is None:
+            return _missing()
+        sign, data = await run_in_threadpool(file.read, request.headers.get("if-none-match", ""))
+        if data is None:
+            return Response(status_code=304 if sign else 204)
+        return Response(data, media_type=file.media_type, headers={"etag": sign})
 
     # ------------------------------------------------------------------ what is asked of the recorder
 

@@ -86,7 +86,10 @@ class Painter:
         return self._reader.extent_m()
 
     def legend(self) -> dict[str, Any]:
-        """Return for each layer its title, its colours and the values at their ends; read what has changed."""
+        """Return for each layer its title, its colours and the values at their ends; read what has changed.
+
+        ``zero_m`` of the heights is that of the map's origin.
+        """
         with self._lock:
             self._reader.refresh()
             low, high = self._height_range()
@@ -94,7 +97,7 @@ class Painter:
         low, high = low + zero_m, high + zero_m
         also = [["gap", "gap"], ["water", "no return (water)"]]
         return {
-            "height": _entry(title, "height", f"{low:.0f} m", f"{high:.0f} m", also),
+            "height": _entry(title, "height", f"{low:.0f} m", f"{high:.0f} m", also) | {"zero_m": zero_m},
             "density": _entry("points per m²", "density", "0", f"{DENSITIES[-1]:.0f} and more", also),
             "difference": _entry(
                 "strip difference", "difference", f"−{100 * DIFFERENCE_M:.0f} cm", f"+{100 * DIFFERENCE_M:.0f} cm", []

@@ -22,6 +22,8 @@ STALE_S = 5.0  # live writes its status each second
 MOST_BYTES = 1 << 23  # of one of live's files
 WORDS = {RECORDING: "RECORDING", DEGRADED: "DEGRADED", NOT_RECORDING: "NOT RECORDING"}
 LIVE_STATUS, LIVE_LINES, LIVE_STEERING = "live.json", "lines.json", "steering.json"
+OVERLAP_MEDIAN, OVERLAP_RMS = "overlap, median dz m", "overlap, RMSDz m"  # as look.js names them
+LOOKS = {"profile": ("profile.json", "application/json"), "recent": ("recent.bin", "application/octet-stream")}
 
 Plain = dict[str, Any]
 
@@ -56,6 +58,25 @@ class JsonFile:
             if isinstance(content, dict):
                 self._content, self._read = content, key
         return self._content
+
+
+@dataclass(frozen=True, slots=True)
+class LookFile:
+    """A file of the last moments, which live replaces and pages read as it is."""
+
+    path: Path
+    media_type: str
+
+    def read(self, known: str) -> tuple[str, bytes | None]:
+        """Return the file's sign and its content; None if the sign is ``known`` already. No sign: no such file."""
+        try:
+            found = self.path.stat()
+            sign = f'"{found.st_mtime_ns:x}-{found.st_size:x}"'
+            if sign == known or found.st_size > MOST_BYTES:
+                return sign, None
+            return sign, self.path.read_bytes()
+        except OSError:
+            return "", None
 
 
 @dataclass(slots=True)
@@ -97,6 +118,7 @@ class Watch(threading.Thread):
         self.steering: Plain = {}
         self._live, self._lines = JsonFile(live / LIVE_STATUS), JsonFile(live / LIVE_LINES)
         self._steering = JsonFile(live / LIVE_STEERING)
+        self.looks = {name: LookFile(live / file, kind) for name, (file, kind) in LOOKS.items()}
         self.tell = tell
         self._events = Numbered()
         self._session: str | None = None
@@ -250,6 +272,8 @@ def _add_live(series: dict[str, float | None], live: Plain) -> None:
             ("intensity_mean", "intensity"),
         ):
             series[f"scanner/{scanner}, {words}"] = ground.get(key)
+    overlap = live.get("overlap") or {}
+    series[OVERLAP_MEDIAN], series[OVERLAP_RMS] = overlap.get("median_m"), overlap.get("rms_m")
     sigma = (live.get("pose") or {}).get("sigma_m")
     if sigma:
         series["position sigma, m"] = max(sigma)

@@ -19,6 +19,7 @@ from PIL import Image
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 from swath.daemon.console.painting import RAMPS
+from swath.daemon.processing.live.look import RECENT_DTYPE, RECENT_HEAD
 from swath.daemon.processing.live.tiles import SIDE
 from tests.daemon.console.builders import Asked, console, write_map
 from tests.daemon.log_check import read_log
@@ -31,6 +32,15 @@ SIZES = ((1920, 1080), (1280, 800), (800, 1280))
 WAIT_MS = 20_000.0
 SCALE = "30 m"  # at four pixels a metre
 CELLS = 40  # along each side of the square that is painted
+PROFILE = {
+    "2": {"across_m": [10.0, 20.0, 30.0], "up_m": [4.0, 6.0, 3.0]},
+    "3": {"across_m": [-40.0, -10.0, 15.0, 25.0], "up_m": [2.0, 5.0, 4.5, 5.5]},
+}
+OVERLAP = {
+    "strip": 3, "cells": 1200, "median_m": -0.012, "rms_m": 0.093, "wanted": "QL2",
+    "limits_m": {"QL0": 0.04, "QL2": 0.08},
+    "against": [{"first": 2, "second": 3, "cells": 1200, "median_m": -0.012, "rms_m": 0.093}],
+}  # fmt: skip
 # as WCAG 2.1 AA, which axe knows by these names
 RULES = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "best-practice"]}
 
@@ -98,7 +108,10 @@ def write_live(live: Path) -> None:
     write_map(live, {(0, 0): {"points": points, "height": np.where(points > 0, 5.0, np.nan)}})
     middle = CELLS / 2
     pose = {"east_m": middle, "north_m": middle, "heading_deg": 90.0, "track_deg": 90.0, "sigma_m": [0.02, 0.02, 0.04]}
-    (live / "live.json").write_text(json.dumps({"state": "following", "pose": pose, "tiles": {"sequence": 1}}))
+    status = {"state": "following", "pose": pose, "tiles": {"sequence": 1}, "overlap": OVERLAP}
+    (live / "live.json").write_text(json.dumps(status))
+    (live / "profile.json").write_text(json.dumps({"track_deg": 90.0, "strips": PROFILE}))
+    (live / "recent.bin").write_bytes(recent_points())
     again = {"name": "9", "state": "again", "flown_fraction": 0.5, "reasons": [{"text": f"GNSS lost {SCRIPT}"}]}
     flying = {"name": "4", "state": "flying", "flown_fraction": 0.25, "reasons": []}
     steering = {"line": "4", "cross_track_m": -12.0, "height_m": 7.0, "track_error_deg": 1.5, "to_begin_m": -400.0,
@@ -106,6 +119,15 @@ def write_live(live: Path) -> None:
                 "bank_deg": 3.0, "bank_limit_deg": 20.0}  # fmt: skip
     (live / "lines.json").write_text(json.dumps({"lines": [flying, again], "current": "4", "next": "9"}))
     (live / "steering.json").write_text(json.dumps({"current": "4", "next": "9", "steering": steering}))
+
+
+def recent_points() -> bytes:
+    """Return a slope of 50 m by 40 m that rises by 10 m to the east, of strips 2 and 3."""
+    rows = np.zeros(500, RECENT_DTYPE)
+    draw = np.random.default_rng(5)
+    rows["east"], rows["north"] = draw.uniform(0.0, 50.0, 500), draw.uniform(0.0, 40.0, 500)
+    rows["up"], rows["strip"], rows["seconds"] = 0.2 * rows["east"], 2 + (rows["north"] > 20.0), 30.0
+    return RECENT_HEAD.pack(b"SWTR", 1, RECENT_HEAD.size, rows.itemsize, len(rows), 0) + rows.tobytes()
 
 
 def keep_current(live: Path) -> None:
@@ -203,7 +225,7 @@ def test_every_cell_is_painted_and_nothing_else(
     assert abs(columns.mean() - frame["width"] / 2) < 3.0
 
 
-@pytest.mark.parametrize("path", ["/", "/pilot", "/login"])
+@pytest.mark.parametrize("path", ["/", "/#data", "/pilot", "/login"])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_no_barrier_is_found(
     aircraft: tuple[Asked, Path], open_page: Callable[..., Opened], path: str, scheme: str
@@ -211,6 +233,8 @@ def test_no_barrier_is_found(
     asked, logs = aircraft
     keep_current(logs / "live")
     page = open_page(asked.url + path, SIZES[2], scheme).page
+    if path.endswith("#data"):
+        page.get_by_role("tab", name="Data").click()
     page.wait_for_timeout(2500)
     found: Any = Axe().run(page, options=RULES)
     told = [f"{one['id']}: {[node['html'] for node in one['nodes']]}" for one in found.response["violations"]]
@@ -241,3 +265,105 @@ def test_a_page_without_its_console_says_so_and_is_whole_again(
         expect(page.locator("#sentence")).to_contain_text("is not known here")
     with console(tmp_path, port=asked.port):
         expect(page.locator("#state")).to_have_text("NOT RECORDING", timeout=WAIT_MS)
+
+
+def pixels_of(page: Page, canvas: str) -> NDArray[np.uint8]:
+    """Return what a canvas holds (rows, columns, 4)."""
+    script = """(canvas) => {
+        const {width, height} = canvas;
+        return {width, height, data: [...canvas.getContext("2d").getImageData(0, 0, width, height).data]};
+    }"""
+    found = page.locator(canvas).evaluate(script)
+    return np.array(found["data"], np.uint8).reshape(found["height"], found["width"], 4)
+
+
+def colour_of(page: Page, strip: int, place: str) -> tuple[int, ...]:
+    """Return the colour of a strip by the legend, which a person reads."""
+    sign = page.locator(f"{place} li", has_text=f"strip {strip}").locator("path")
+    return tuple(int(str(sign.get_attribute("fill"))[at : at + 2], 16) for at in (1, 3, 5))
+
+
+@pytest.fixture
+def data_panel(aircraft: tuple[Asked, Path], open_page: Callable[..., Opened]) -> Page:
+    asked, logs = aircraft
+    keep_current(logs / "live")
+    page = open_page(asked.url, SIZES[2]).page
+    page.get_by_role("tab", name="Data").click()
+    expect(page.locator("#cloud-words")).to_contain_text("500 points of the last 30 s", timeout=WAIT_MS)
+    return page
+
+
+def test_the_profile_shows_each_point_at_its_place_in_its_strip_s_colour(data_panel: Page) -> None:
+    """The frame that the axes' figures are written from tells where each point has to be."""
+    shown = pixels_of(data_panel, "#profile")[..., :3].astype(int)
+    frame = json.loads(str(data_panel.locator("#profile").get_attribute("data-frame")))
+    for name, strip in PROFILE.items():
+        colour = np.array(colour_of(data_panel, int(name), "#profile-key"))
+        is_strip = np.abs(shown - colour).max(axis=-1) < 40
+        x = (
+            frame["left"]
+            + (np.array(strip["across_m"]) - frame["west"]) / (frame["east"] - frame["west"]) * frame["width"]
+        )
+        y = frame["top"] + (frame["high"] - np.array(strip["up_m"])) / (frame["high"] - frame["low"]) * frame["height"]
+        near = np.zeros_like(is_strip)
+        for column, row in zip(x, y, strict=True):
+            around = np.s_[round(row) - 4 : round(row) + 4, round(column) - 4 : round(column) + 4]
+            assert is_strip[around].any(), (name, column, row)
+            near[around] = True
+        assert not (is_strip & ~near).any(), name
+    expect(data_panel.locator("#profile-words")).to_contain_text("strip 2: 3 points; strip 3: 4 points")
+
+
+def test_the_points_are_seen_as_turning_and_nearness_demand(data_panel: Page) -> None:
+    """NumPy turns the points by matrices about the vertical and the horizontal axis, and paints far ones first."""
+    data_panel.get_by_label("Colour").select_option("strip")
+    data_panel.locator("#cloud").focus()
+    for key in ("ArrowLeft", "ArrowLeft", "ArrowUp", "+"):
+        data_panel.keyboard.press(key)
+    view = json.loads(str(data_panel.locator("#cloud").get_attribute("data-view")))
+    shown = pixels_of(data_panel, "#cloud")
+    rows = np.frombuffer(recent_points(), RECENT_DTYPE, 500, RECENT_HEAD.size)
+    places = np.stack([rows["east"] - view["east"], rows["north"] - view["north"], rows["up"] - view["level"]], 1)
+    azimuth, elevation = np.radians([view["azimuth"], view["elevation"]])
+    turn = np.array([[np.cos(azimuth), -np.sin(azimuth), 0], [np.sin(azimuth), np.cos(azimuth), 0], [0, 0, 1]])
+    tilt = np.array([[1, 0, 0], [0, np.sin(elevation), np.cos(elevation)], [0, np.cos(elevation), -np.sin(elevation)]])
+    seen = places @ turn.T @ tilt.T  # right, up, away
+    height, width = shown.shape[:2]
+    wanted = np.zeros((height, width, 3), np.uint8)
+    for k in np.argsort(-seen[:, 2]):
+        column, row = int(width / 2 + seen[k, 0] * view["perM"]), int(height / 2 - seen[k, 1] * view["perM"])
+        if 0 <= row < height and 0 <= column < width:
+            wanted[row : row + 2, column : column + 2] = colour_of(data_panel, int(rows["strip"][k]), "#cloud-key")
+    free = np.s_[: height - 40]  # the scale bar stands below
+    differs = (shown[free][..., :3] != wanted[free]).any(axis=-1)
+    assert (wanted[free].any(axis=-1)).sum() > 500
+    assert differs.sum() < 0.01 * wanted.any(axis=-1).sum()
+    assert view["azimuth"] != 20
+    assert view["closer"] == 1.25
+
+
+def test_two_fingers_bring_the_points_nearer_and_turn_nothing(data_panel: Page) -> None:
+    box = data_panel.locator("#cloud").bounding_box()
+    assert box is not None
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    before = json.loads(str(data_panel.locator("#cloud").get_attribute("data-view")))
+    fingers = data_panel.context.new_cdp_session(data_panel)
+
+    def touch(kind: str, *apart: float) -> None:
+        points = [{"x": x + side * one, "y": y, "id": number} for one in apart for number, side in ((0, -1), (1, 1))]
+        fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    touch("touchStart", 40)
+    for apart in (50, 60, 80):
+        touch("touchMove", apart)
+    touch("touchEnd")
+    after = json.loads(str(data_panel.locator("#cloud").get_attribute("data-view")))
+    assert after["closer"] == pytest.approx(2.0 * before["closer"], rel=0.05)
+    assert (after["azimuth"], after["elevation"]) == (before["azimuth"], before["elevation"])
+
+
+def test_the_overlap_is_told_against_the_quality_level_wanted(data_panel: Page) -> None:
+    expect(data_panel.locator("#overlap-words")).to_have_text(
+        "Strip 3: median −1.2 cm, RMSDz 9.3 cm in 1,200 cells, BEYOND QL2 (8.0 cm)", timeout=WAIT_MS
+    )
+    expect(data_panel.locator("#overlap-rows tr")).to_contain_text(["2 − 3"])

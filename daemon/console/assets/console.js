@@ -1,6 +1,7 @@
 // The operator's page: header, panels and marks. The map has a module of its own.
 import { ask, begin, clock, listen, number, text } from "./feed.js";
 import { showGraphs } from "./graphs.js";
+import { prepareLook, showLook } from "./look.js";
 import { startMap } from "./map.js";
 
 const SHAPES = { RECORDING: "●", DEGRADED: "▲", "NOT RECORDING": "■" };
@@ -164,6 +165,7 @@ function choose(tab) {
     one.setAttribute("aria-selected", String(chosen));
     $(one.getAttribute("aria-controls")).hidden = !chosen;
   }
+  if (tab.id === "tab-data") listen((found) => showLook($("data"), found), { once: true });
 }
 
 pressed("night", String(matchMedia("(prefers-color-scheme: dark)").matches), (on) => document.documentElement.toggleAttribute("data-night", on));
@@ -184,6 +186,7 @@ $("acknowledge").addEventListener("click", () => {
   }, { once: true });
 });
 prepareMarks();
+prepareLook();
 startMap();
 listen((found, role) => {
   for (const control of document.querySelectorAll("#marking button, #marking input")) control.disabled = role !== "operator";
@@ -191,6 +194,7 @@ listen((found, role) => {
   showLines(found);
   showSensors(found);
   showGraphs($("graphs"), found);
+  showLook($("data"), found);
   showEvents(found);
 });
 begin(() => {

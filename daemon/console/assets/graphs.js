@@ -50,6 +50,9 @@ function draw(canvas, values, now) {
   pen.stroke();
 }
 
+// Times and values of the last ten minutes; empty if there is no such series.
+export const seriesNamed = (name) => ({ times, values: series.get(name) ?? [] });
+
 export function showGraphs(place, found) {
   if (!loaded) load();
   take(found);

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from swath.calib.strips.standards import QUALITY_LEVELS
 from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.processing.carried_verdict import first_lines
@@ -71,6 +72,10 @@ class LiveStatus:
         self.navigation: str | None = None
         self._fixes_seen = {} if fixes is None else fixes
         self._setup, self._stream, self._products = setup, stream, products
+        self._overlap_limits = {
+            "wanted": setup.config.tables.plan.wanted.quality_level,
+            "limits_m": {level.name: level.overlap_m for level in QUALITY_LEVELS},
+        }
         self._pulse: dict[str, Latencies] = {}
         self._log: dict[str, Latencies] = {}
         self._newest_ns: dict[str, int] = {}  # log time of a source's newest unit
@@ -147,7 +152,7 @@ class LiveStatus:
             "pose": products.pose(),
             "ground": products.look.ground(),
             "gnss": {source: fix_in_words(fix, now_ns) for source, fix in sorted(self._fixes_seen.items())},
-            "overlap": products.map.comparison.present(),
+            "overlap": products.map.comparison.present() | self._overlap_limits,
             "live_mcap": {"points_written": products.shown, "points_not_written": products.unwritten},
             "free_bytes": products.room.free_bytes,
             "stops_writing_at_bytes": products.room.least_bytes,

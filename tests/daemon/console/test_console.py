@@ -201,6 +201,21 @@ def test_the_map_is_painted_as_live_writes_it(tmp_path: Path) -> None:
         assert painted.headers["content-type"] == "image/png"
         assert painted.body != empty.body
         wait_until(lambda: asked.snapshot()["extent_m"] == [0.0, 0.0, 128.0, 128.0], "the map's edges")
+        the_last_moments_are_given_once(asked, tmp_path / "live")
+
+
+def the_last_moments_are_given_once(asked: Asked, live: Path) -> None:
+    """Ask with the sign of what a page has: it gets nothing until live replaces the file."""
+    assert asked.get("/look/profile").status == asked.get("/look/recent").status == 204  # live has written none yet
+    assert asked.get("/look/live").status == asked.get("/look/..%2flive.json").status == 404
+    for name, file in (("profile", "profile.json"), ("recent", "recent.bin")):
+        (live / file).write_bytes(b"before")
+        first = asked.get(f"/look/{name}")
+        assert (first.status, first.body) == (200, b"before")
+        sign = first.headers["etag"]
+        assert asked.get(f"/look/{name}", If_None_Match=sign).status == 304
+        (live / file).write_bytes(b"afterwards")
+        assert asked.get(f"/look/{name}", If_None_Match=sign).body == b"afterwards"
 
 
 def test_files_that_are_no_json_leave_the_console_well(tmp_path: Path) -> None:

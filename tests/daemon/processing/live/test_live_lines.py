@@ -65,6 +65,7 @@ def flown(folder: Path, plan: Plan, planned: str) -> Path:
     text = config_text(plan, default_wires(plan), "logs").replace('"novatel"', '"novatel"\ndatum = "same"')
     text = text.replace("nominal.toml", "true.toml")
     text += '[plan]\nfile = "plan.toml"\n[plan.wanted]\ndensity_per_m2 = 0.1\noverlap_percent = 20\n'
+    text += 'quality_level = "QL2"\n'
     (folder / "swath.toml").write_text(text)
     return fly_into_log(load_config(folder / "swath.toml"), folder / "logs", flight, plan.tables.flight.seed).paths[0]
 
@@ -75,6 +76,8 @@ def test_faults_of_a_recorded_flight_are_told_line_by_line(tmp_path: Path) -> No
     done = swath("live", "--replay", str(log), "-o", str(tmp_path / "out"))
     assert done.returncode == 0, done.stderr
     assert "FLY AGAIN: 1, 3" in done.stdout
+    overlap = json.loads((tmp_path / "out/live.json").read_text())["overlap"]
+    assert (overlap["wanted"], overlap["limits_m"]["QL2"]) == ("QL2", 0.08)
     lines = json.loads((tmp_path / "out/lines.json").read_text())
     found = {
         line["name"]: (line["state"], {one["code"]: one["grave"] for one in line["reasons"]}) for line in lines["lines"]
