@@ -518,6 +518,8 @@ class PlanWantedConfig(Section):
     quality_level: Literal["QL0", "QL1", "QL2", "QL3"] | None = Field(
         None, description="USGS quality level whose RMSDz overlapping strips have to keep; shown, no line's verdict"
     )
+    gap_m2: float = Field(100.0, gt=0.0, le=1e6, description="smallest gap in the area that is reported")
+    static_s: float = Field(60.0, ge=0.0, le=3600.0, description="standing still before take-off and after landing")
 
 
 class PlanConfig(Section):

@@ -91,6 +91,16 @@ class LocalFrame:
         away: FloatArray = points - self.origin
         return away @ self._rot_points_from_enu if self.is_level else away * self.unit_m
 
+    def of_geodetic(self, lat_lon_deg: FloatArray) -> FloatArray:
+        """Return east and north (n, 2) of latitudes and longitudes (n, 2) in degrees, at the first position's height.
+
+        Raises:
+            ValueError: the mapping frame has no place for one of them.
+        """
+        lat, lon = np.radians(lat_lon_deg).T
+        height = np.full(len(lat), float(geodetic_from_e(self._position_e)[2]))
+        return self.of_points(self._mapped(e_from_geodetic(lat, lon, height)))[:, :2]
+
     def cloud_of(self, points: Points, keep: Int64Array) -> NDArray[Any]:
         """Return the points with the indexes ``keep`` as `CLOUD_DTYPE`."""
         cloud = np.empty((len(keep), 4), np.float32)

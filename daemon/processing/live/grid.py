@@ -59,6 +59,7 @@ class CellGrid:
         self._cells = np.zeros((tiles, SIDE, SIDE), dtype=CELL_DTYPE)
         self._bases = np.zeros(tiles, np.float32)
         self._changed = np.zeros(tiles, np.uint8)
+        self._unseen = np.zeros(tiles, np.uint8)  # taken by `take_changed`, and not yet by `take_unseen`
         self._keys = np.full(_SLOTS, _EMPTY, dtype=np.int64)
         self._slots = np.zeros(_SLOTS, dtype=np.int64)
         self._places = np.zeros((tiles, 2), dtype=np.int64)  # column and row of each tile held
@@ -135,7 +136,7 @@ class CellGrid:
             top, left = (row & 1) * half, (column & 1) * half
             shift = round(100.0 * float(base - self._bases[slot]))
             self._cells[slot, top : top + half, left : left + half] = _joined(tile, shift)
-        self._changed[:] = 0
+        self._changed[:] = self._unseen[:] = 0
         self._changed[: self.held] = 1
 
     def take_changed(self) -> Iterator[tuple[Place, Callable[[Head], bytes]]]:
@@ -143,7 +144,14 @@ class CellGrid:
         for slot in np.flatnonzero(self._changed[: self.held]).tolist():
             column, row = self._places[slot].tolist()
             yield (column, row), partial(self._packed, slot)
-            self._changed[slot] = 0
+            self._changed[slot], self._unseen[slot] = 0, 1
+
+    def take_unseen(self) -> Iterator[tuple[Place, StructArray]]:
+        """Yield places and cells (`SIDE`, `SIDE`), `CELL_DTYPE`, of tiles that have changed since the last call."""
+        for slot in np.flatnonzero((self._changed | self._unseen)[: self.held]).tolist():
+            column, row = self._places[slot].tolist()
+            yield (column, row), self._cells[slot]
+            self._unseen[slot] = 0
 
     @property
     def has_changed(self) -> bool:

@@ -19,6 +19,7 @@ from swath.daemon.processing.flightplan.plan import FlightPlan, PlanError
 from swath.daemon.processing.flightplan.read import plan_of
 from swath.daemon.processing.flightplan.strips import StripWatch
 from swath.daemon.processing.flightplan.watch import LineWatch
+from swath.daemon.processing.landing.facts import LogFacts
 from swath.daemon.processing.live.frame import LocalFrame
 from swath.daemon.processing.live.tiles import replace_file
 from swath.daemon.processing.points.feed import Placed
@@ -60,19 +61,20 @@ class LiveLines:
 
     Attributes:
         trouble: why there is no plan although one is configured; empty: there is one, or none is wanted.
+        plan: the plan that is used; None: there is none.
         parser: gives a source's parser, for the gaps that it counts; the feed's.
     """
 
-    def __init__(self, setup: Setup, stream: Stream, folder: Path) -> None:
+    def __init__(self, setup: Setup, stream: Stream, folder: Path, facts: LogFacts) -> None:
         self.trouble = ""
         self.parser: Callable[[str], Parser] | None = None
         self.watch: LineWatch | StripWatch = StripWatch(setup.config.tables.plan)
-        plan = self._plan(setup)
+        self.plan = plan = self._plan(setup)
         if plan is not None:
             self.watch = LineWatch(plan, setup.config.tables.plan)
         self._notes = () if plan is None else plan.notes
         self._stream, self._mapping, self._path = stream, setup.mapping, folder / LINES
-        self._moments = Moments(stream.scanners)
+        self._moments, self._facts = Moments(stream.scanners), facts
         self._frame: LocalFrame | None = None
         self._next_ns = self._steered_ns = -(1 << 62)
         self._fixes: dict[str, tuple[FixType, int]] = {}  # by receiver: quality and host time of the newest position
@@ -118,6 +120,7 @@ class LiveLines:
             seen[0] += returns
             seen[1] += len(record.rows) - returns
         elif isinstance(record, GnssFix) and (record.lat_rad is not None or record.fix_type is FixType.NONE):
+            self._facts.fix(source, record)
             fix_type = record.fix_type if record.valid else FixType.NONE
             self._fixes[source] = fix_type, record.host_time_ns
 
@@ -141,7 +144,9 @@ class LiveLines:
             for name, (returns, empty) in self._seen.items():
                 self._moments.add_seen(int(rows["gps_ns"][-1]), name, returns, empty)
             self._seen.clear()
-        self.watch.moments(self._moments.settled(last=tick_ns is None))
+        settled = self._moments.settled(last=tick_ns is None)
+        self._facts.moments(settled)
+        self.watch.moments(settled)
         if tick_ns is None:
             self.watch.close()
 

@@ -200,15 +200,19 @@ class LiveProducts:
         due = self.map.grid.has_changed if last else self.map.is_due(log_time_ns)
         if not due or not self._has_space:
             return
-        if self._placement is None and self.frame is not None:
-            self._placement = {"placement": self.frame.placement()}
-        self.map.save(log_time_ns, self.origin() | (self._placement or {}) | latest)
+        self.map.save(log_time_ns, self.origin() | self.placement() | latest)
         if self._mcap is not None:
             self._mcap.beside_bytes = self.map.file_bytes
         try:
             self.look.save(self._folder, self.map.cutter.edges(), self.map.comparison.heights, last=last)
         except OSError as error:
             self.map.trouble = f"{PROFILE}: {error.strerror or error}: the last moments are not written"
+
+    def placement(self) -> dict[str, Any]:
+        """Return the entry ``placement`` of the map's index; nothing before there is a frame."""
+        if self._placement is None and self.frame is not None:
+            self._placement = {"placement": self.frame.placement()}
+        return self._placement or {}
 
     def pose(self) -> dict[str, Any] | None:
         """Return the newest pose for people; None: there is none.

@@ -21,11 +21,14 @@ from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.reader import Session
 from swath.daemon.log.session import read_boot_id
 from swath.daemon.processing.carried_verdict import calibration_verdicts, verdict_entry
+from swath.daemon.processing.landing.checks import Covered
+from swath.daemon.processing.landing.watch import VERDICT, Landing, Places
 from swath.daemon.processing.live.follow import LiveFollower, LivePart, Skipped
 from swath.daemon.processing.live.lines import LINES, LiveLines
 from swath.daemon.processing.live.points import PointsFile
 from swath.daemon.processing.live.products import LiveProducts, Room
 from swath.daemon.processing.live.status import LiveStatus, sentence, write_status
+from swath.daemon.processing.live.tiles import Placement
 from swath.daemon.processing.points.feed import LogFeed, Placed
 from swath.daemon.processing.setup.sent_files import SentFiles
 from swath.daemon.processing.setup.setup import Options, Setup, config_in_log
@@ -69,6 +72,8 @@ class LiveSession:
         now_ns: host time up to which the log has been read; a live session uses the clock instead.
         verdict: verdict on the calibrations, for the status.
         lines: the state of the lines.
+        landing: the verdict before landing.
+        log_state: what is known of the log: ``part``, ``damaged_chunks``, ``live_skipped_s``.
     """
 
     def __init__(
@@ -96,7 +101,9 @@ class LiveSession:
         self._stream = setup.live_stream(info)
         self._path = _SeenPath(self._stream.path)
         self._stream.path = self._path
-        self.lines = LiveLines(setup, self._stream, folder)
+        tables = setup.config.tables
+        self.landing = Landing(info, folder, tables.plan, list(tables.corrections), self.verdict)
+        self.lines = LiveLines(setup, self._stream, folder, self.landing.facts)
         self._feed = LogFeed(setup, self._stream, self.lines)
         self.lines.parser = self._feed.parser
         if setup.sources.ins_source is None and self._feed.navigator is None:
@@ -110,6 +117,7 @@ class LiveSession:
         about = setup.options.crs or setup.config.output.crs or "EPSG:4978 (no [output] crs)"
         self.products = LiveProducts(folder, live, setup.mapping, reserve_bytes, about, self._gps_from_host)
         self.status = LiveStatus(setup, self._stream, self.products, self._feed.fixes)
+        self.log_state: Told = {}
         self.points: PointsFile | None = None
         if points is not None:
             room = Room(points.parent, 2 * reserve_bytes) if beside_recorder else None
@@ -120,6 +128,7 @@ class LiveSession:
         """Take the next messages."""
         self.now_ns = max(self.now_ns, int(batch.log_time_ns[-1]))
         self.status.note_batch(batch, self.host_now_ns(live=live))
+        self.landing.note_batch(batch)
         if batch.channel.chunk_class == "scanner":
             self.products.map.cutter.note_laser(int(batch.log_time_ns[0]), int(batch.log_time_ns[-1]))
         placed = self._feed.take(batch)
@@ -129,6 +138,34 @@ class LiveSession:
         self.products.take_pose(self._path.trajectory, self.now_ns)
         self.products.save_map({"session_id": self.info.session_id}, self.now_ns)
         self._save_lines()
+        if self.landing.is_due(self.now_ns):
+            self._save_verdict()
+
+    def _save_verdict(self) -> None:
+        """Write the verdict before landing, unless free space is low."""
+        found = self._covered()
+        if not self.products.room.is_enough:
+            return
+        lines, comparison = self.lines, self.products.map.comparison
+        verdict = self.landing.verdict(
+            lines.watch, lines.plan, lines.trouble, found, comparison.total.numbers(), self.log_state
+        )
+        try:
+            self.landing.save(verdict, self.now_ns)
+        except OSError as error:
+            self.products.trouble = f"{VERDICT}: {error.strerror or error}: the verdict is not written"
+
+    def _covered(self) -> Covered | None:
+        """Return how the area is covered; None: nothing is known of it."""
+        frame, grid = self.products.frame, self.products.map.grid
+        places = None
+        if frame is not None:
+            placement = Placement.of(self.products.placement())
+            places = Places(frame.of_geodetic, None if placement is None else placement.geodetic)
+        try:
+            return self.landing.look((grid.cell_m, grid.take_unseen()), self.lines.watch, self.lines.plan, places)
+        except ValueError:  # the area lies beyond the mapping frame
+            return None
 
     def _save_lines(self, *, last: bool = False) -> None:
         """Write the state of the lines, unless free space is low."""
@@ -169,6 +206,7 @@ class LiveSession:
         self.products.map.end()
         self.products.save_map({"session_id": self.info.session_id}, self.now_ns, last=True)
         self._save_lines(last=True)
+        self._save_verdict()
         self.products.close()
         if self.points is not None:
             self.points.close()
@@ -273,6 +311,7 @@ class Live:
             return
         self._told_s = now_s
         if self._session is not None:
+            self._session.log_state = self._log_state()
             self._session.look_for_room()
             if now_s - self._covered_s > self._coverage_s:
                 self._covered_s = now_s
@@ -282,6 +321,12 @@ class Live:
         if self._held and self._sent is not None:
             waiting = f"waiting for the angles of scanner {', '.join(self._sent.missing)}"
         self._say("following" if self._session is not None else waiting)
+
+    def _log_state(self) -> Told:
+        follower = self._follower
+        damaged = follower.damaged + (follower.part.damaged if follower.part else 0)
+        part = None if follower.part is None else follower.part.number
+        return {"part": part, "damaged_chunks": damaged, "live_skipped_s": follower.skipped_ns * 1e-9}
 
     def _about(self) -> Told:
         part = self._follower.part
@@ -307,6 +352,7 @@ class Live:
         if self._held and part is not None and self._sent is not None:
             self._begin(part, self._sent.found)
         if self._session is not None:
+            self._session.log_state = self._log_state()
             self._session.close(live=True)
             self._session.products.save_coverage(self._about())
         found = self._say(f"ended ({self._follower.ended or 'stopped'})")
@@ -366,6 +412,7 @@ def replay(
             run.take(batch, live=False)
             if tell is not None:
                 tell(run.now_ns)
+        run.log_state = {"part": session.parts[-1].number, "damaged_chunks": len(session.damage)}
         run.close(live=False)
         about = {"session_id": session.session_id, "part": session.parts[-1].number}
         run.products.save_coverage(about)

@@ -23,6 +23,9 @@ from swath.sim.site import Site
 GROUND_M = 450.0
 HALF_ANGLE_RAD = math.radians(30.0)
 RETURNS = 10_000  # of a moment
+HEIGHT_M = GROUND_M + 600.0
+WIDTH_M = 2 * 600.0 * math.tan(HALF_ANGLE_RAD)
+DENSITY = RETURNS * 10 / (WIDTH_M * 60.0)
 
 
 @dataclass(frozen=True)
@@ -212,3 +215,56 @@ def _settle(watched: Any, settled: StructArray, rows: StructArray, first_ns: int
     for column in columns:
         settled[column] = told[column]
     watched.moments(settled)
+
+
+def parallel(count: int, spacing_m: float, length_m: float = 1200.0, **keys: Any) -> list[dict[str, Any]]:
+    """Return east–west lines, the next to the north, flown to and fro."""
+    lines = []
+    for number in range(count):
+        ends = [[-length_m / 2, number * spacing_m], [length_m / 2, number * spacing_m]]
+        if number % 2:
+            ends.reverse()
+        one = {"name": str(number + 1), "from_m": ends[0], "to_m": ends[1], "height_m": HEIGHT_M}
+        lines.append(one | keys)
+    return lines
+
+
+SPREAD = {
+    "off": (28, 60), "high": (70, 150), "fast": (11, 16), "bank": (21, 35), "tilt": (12, 18), "silent": (5, 9),
+    "late": (120, 400), "early": (120, 400), "gnss": (5, 45), "time": (3, 10), "holdover": (3, 10),
+    "sparse": (0.2, 0.45), "lost": (1, 50), "water": (3, 8),
+}  # fmt: skip
+
+
+def is_grave(defect: Defect) -> bool:
+    """Return whether a line with this defect must be flown again."""
+    grave = KINDS[defect.kind][1]
+    return defect.size >= 30.0 if grave is None else grave
+
+
+def drawn(rng: np.random.Generator, kinds: list[str], seed: int) -> Flight:
+    """Draw a block of parallel lines and a crossing one, flown two apart, with three defects of kinds in turn."""
+    length_m, spacing_m, above_m = rng.uniform(2500, 4000), rng.uniform(350, 500), rng.uniform(700, 1100)
+    azimuth = rng.uniform(0, math.pi)
+    turn = np.array([[math.cos(azimuth), -math.sin(azimuth)], [math.sin(azimuth), math.cos(azimuth)]])
+    ends = [((-length_m / 2, (place - 2) * spacing_m), (length_m / 2, (place - 2) * spacing_m)) for place in range(5)]
+    ends.append(((0.0, -length_m / 2), (0.0, length_m / 2)))
+    lines = []
+    for number, place in enumerate([0, 2, 4, 1, 3, 5]):
+        begin, end = ends[place] if number % 2 else ends[place][::-1]
+        lines.append(
+            {
+                "name": f"{place + 1}",
+                "from_m": (turn @ np.array(begin)).tolist(),
+                "to_m": (turn @ np.array(end)).tolist(),
+                "height_m": GROUND_M + above_m,
+            }
+        )
+    places = rng.permutation(6)[:3]
+    defects = []
+    for number, place in enumerate(places.tolist()):
+        kind = kinds[(3 * seed + number) % len(kinds)]
+        defects.append(Defect(lines[place]["name"], kind, rng.uniform(0.1, 0.9), rng.uniform(*SPREAD[kind])))
+    density = RETURNS * 10 / (2 * above_m * math.tan(HALF_ANGLE_RAD) * 60.0)
+    turbulence = ["none", "light", "moderate"][seed % 3]
+    return flown(lines, defects, {"density_per_m2": 0.8 * density}, seed=seed, turbulence=turbulence)

@@ -13,33 +13,20 @@ from swath.daemon.processing.flightplan.lines import parsed_overrule
 from swath.daemon.processing.flightplan.moments import STEP_NS, Moments, empty_moments
 from swath.daemon.processing.flightplan.watch import LineWatch
 from tests.daemon.processing.flightplan.builders import (
-    GROUND_M,
-    HALF_ANGLE_RAD,
+    DENSITY,
     KINDS,
-    RETURNS,
+    WIDTH_M,
     Defect,
     Flight,
+    drawn,
     flown,
+    is_grave,
     moments_of,
+    parallel,
     watch,
 )
 
 GEOD = Geod(ellps="WGS84")
-HEIGHT_M = GROUND_M + 600.0
-WIDTH_M = 2 * 600.0 * math.tan(HALF_ANGLE_RAD)
-DENSITY = RETURNS * 10 / (WIDTH_M * 60.0)
-
-
-def parallel(count: int, spacing_m: float, length_m: float = 1200.0, **keys: Any) -> list[dict[str, Any]]:
-    """Return east–west lines, the next to the north, flown to and fro."""
-    lines = []
-    for number in range(count):
-        ends = [[-length_m / 2, number * spacing_m], [length_m / 2, number * spacing_m]]
-        if number % 2:
-            ends.reverse()
-        one = {"name": str(number + 1), "from_m": ends[0], "to_m": ends[1], "height_m": HEIGHT_M}
-        lines.append(one | keys)
-    return lines
 
 
 def states(flight: Flight, **options: Any) -> dict[str, tuple[str, dict[str, bool]]]:
@@ -222,13 +209,13 @@ def test_every_defect_of_fifty_flights_is_found() -> None:
     kinds, wrong, verdicts = list(KINDS), [], 0
     for seed in range(50):
         rng = np.random.default_rng(seed)
-        flight = _drawn(rng, kinds, seed)
+        flight = drawn(rng, kinds, seed)
         plain = watch(flight, moments_of(flight)).plain()
         for line in plain["lines"]:
             verdicts += 1
             mine = [one for one in flight.defects if one.line == line["name"]]
             reasons = {reason["code"]: reason["grave"] for reason in line["reasons"]}
-            due = {KINDS[one.kind][0]: _is_grave(one) for one in mine}
+            due = {KINDS[one.kind][0]: is_grave(one) for one in mine}
             for code, grave in due.items():
                 assert reasons.get(code) is grave, (seed, mine, line["reasons"])
             also = {"density"} if any(one.kind in ("fast", "high") for one in mine) else set()
@@ -236,43 +223,3 @@ def test_every_defect_of_fifty_flights_is_found() -> None:
             if set(reasons) - set(due) - also or (line["state"] != expected and not also):
                 wrong.append((seed, line["name"], mine, line["reasons"]))
     assert len(wrong) <= 0.01 * verdicts, wrong
-
-
-SPREAD = {
-    "off": (28, 60), "high": (70, 150), "fast": (11, 16), "bank": (21, 35), "tilt": (12, 18), "silent": (5, 9),
-    "late": (120, 400), "early": (120, 400), "gnss": (5, 45), "time": (3, 10), "holdover": (3, 10),
-    "sparse": (0.2, 0.45), "lost": (1, 50), "water": (3, 8),
-}  # fmt: skip
-
-
-def _is_grave(defect: Defect) -> bool:
-    grave = KINDS[defect.kind][1]
-    return defect.size >= 30.0 if grave is None else grave
-
-
-def _drawn(rng: np.random.Generator, kinds: list[str], seed: int) -> Flight:
-    """Draw a block of parallel lines and a crossing one, flown two apart, with three defects of kinds in turn."""
-    length_m, spacing_m, above_m = rng.uniform(2500, 4000), rng.uniform(350, 500), rng.uniform(700, 1100)
-    azimuth = rng.uniform(0, math.pi)
-    turn = np.array([[math.cos(azimuth), -math.sin(azimuth)], [math.sin(azimuth), math.cos(azimuth)]])
-    ends = [((-length_m / 2, (place - 2) * spacing_m), (length_m / 2, (place - 2) * spacing_m)) for place in range(5)]
-    ends.append(((0.0, -length_m / 2), (0.0, length_m / 2)))
-    lines = []
-    for number, place in enumerate([0, 2, 4, 1, 3, 5]):
-        begin, end = ends[place] if number % 2 else ends[place][::-1]
-        lines.append(
-            {
-                "name": f"{place + 1}",
-                "from_m": (turn @ np.array(begin)).tolist(),
-                "to_m": (turn @ np.array(end)).tolist(),
-                "height_m": GROUND_M + above_m,
-            }
-        )
-    places = rng.permutation(6)[:3]
-    defects = []
-    for number, place in enumerate(places.tolist()):
-        kind = kinds[(3 * seed + number) % len(kinds)]
-        defects.append(Defect(lines[place]["name"], kind, rng.uniform(0.1, 0.9), rng.uniform(*SPREAD[kind])))
-    density = RETURNS * 10 / (2 * above_m * math.tan(HALF_ANGLE_RAD) * 60.0)
-    turbulence = ["none", "light", "moderate"][seed % 3]
-    return flown(lines, defects, {"density_per_m2": 0.8 * density}, seed=seed, turbulence=turbulence)

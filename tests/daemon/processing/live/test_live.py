@@ -183,7 +183,7 @@ class TestPoints:
                     first = last
 
         replay(flown.session(), flown.setup(), tmp_path, LiveConfig(), tmp_path / "points.npy", batches=cut())
-        for name in ("points.npy", "coverage.png", "lines.json"):
+        for name in ("points.npy", "coverage.png", "lines.json", "verdict.json"):
             assert (tmp_path / name).read_bytes() == (replayed[0] / name).read_bytes(), name
         ours, theirs = (whole_map(folder) for folder in (tmp_path, replayed[0]))
         assert ours["points"].sum() > 10_000
@@ -254,6 +254,10 @@ class TestStatus:
         assert (steering["current"], steering["next"], steering["steering"]) == (None, "1", None)  # after the end
         assert steering["gps_ns"] == one["end_gps_ns"]
         assert found["lines"]["fly_again"] == ["1"]
+        verdict = json.loads((folder / "verdict.json").read_text())
+        assert verdict["sentence"] == "Fly again: line 1. Not flown: line 2"
+        states = {check["code"]: check["state"] for check in verdict["checks"]}
+        assert (states["lines"], states["base"], states["log"]) == ("again", "unknown", "good")
         assert "FLY AGAIN: 1;" in found["sentence"] + ";"
         assert found["gnss"]["gnss/rover"]["fix"] == "rtk_fixed"
         assert found["pose"]["speed_mps"] == pytest.approx(50.0, abs=1.0)

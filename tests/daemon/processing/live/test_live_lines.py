@@ -78,6 +78,8 @@ def test_faults_of_a_recorded_flight_are_told_line_by_line(tmp_path: Path) -> No
     assert "FLY AGAIN: 1, 3" in done.stdout
     overlap = json.loads((tmp_path / "out/live.json").read_text())["overlap"]
     assert (overlap["wanted"], overlap["limits_m"]["QL2"]) == ("QL2", 0.08)
+    verdict = json.loads((tmp_path / "out/verdict.json").read_text())
+    assert verdict["sentence"].startswith("Fly again: lines 1, 3")
     lines = json.loads((tmp_path / "out/lines.json").read_text())
     found = {
         line["name"]: (line["state"], {one["code"]: one["grave"] for one in line["reasons"]}) for line in lines["lines"]

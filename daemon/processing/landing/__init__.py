@@ -1,0 +1,1 @@
+"""Judges before landing whether a flight is complete: lines, gaps, density, calibration, base data, log."""
