@@ -57,8 +57,8 @@ IMPORTED_LATE = {
     "swath.daemon.simulate.plans": {"swath.sim"},  # the only import of the virtual aircraft
     "swath.daemon.system": {"psutil"},
     # asammdf, rosbags, pyarrow
+    "swath.drivers.captures.can.mf4_reader": {"asammdf"},  # its absence is told as a line
     "swath.drivers.captures.opening": {
-        "swath.drivers.captures.can",
         "swath.drivers.captures.rosbag.bag",
         "swath.drivers.captures.tables",
     },

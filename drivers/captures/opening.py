@@ -19,6 +19,7 @@ from swath.drivers.captures.can.blf import MAGIC as BLF_MAGIC
 from swath.drivers.captures.can.blf import blf_time, read_blf
 from swath.drivers.captures.can.candump import candump_line, candump_time, held_by_line, is_candump, read_candump
 from swath.drivers.captures.can.clock import FileClock, FileTime
+from swath.drivers.captures.can.mf4 import mf4_time, read_mf4
 from swath.drivers.captures.can.trc import is_trc, read_trc, trc_time
 from swath.drivers.captures.lvx import LvxHead, is_lvx, read_lvx, read_lvx_heads, tells_time
 from swath.drivers.captures.pcap.files import is_pcap
@@ -90,8 +91,7 @@ def can_log_time(path: Path, kind: str) -> FileTime:
         TransportError: it cannot be read, or asammdf is not installed.
     """
     if kind == "mf4":
-        told: FileTime = _mf4(path).mf4_time(path)
-        return told
+        return mf4_time(path)
     return {"candump": candump_time, "asc": asc_time, "trc": trc_time, "blf": blf_time}[kind](path)
 
 
@@ -105,19 +105,8 @@ def read_can_log(path: Path, kind: str, clock: FileClock, tally: CaptureTally | 
     if kind == "candump":
         return read_candump(path, tally=tally, clock=clock)
     if kind == "mf4":
-        units: Iterator[CapturedUnit] = _mf4(path).read_mf4(path, clock, tally)
-        return units
+        return read_mf4(path, clock, tally)
     return {"asc": read_asc, "trc": read_trc, "blf": read_blf}[kind](path, clock, tally)
-
-
-def _mf4(path: Path) -> ModuleType:
-    try:
-        from swath.drivers.captures.can import mf4
-    except ImportError as error:
-        raise TransportError(
-            f"{path}: MF4 files need asammdf, which is not installed: {how_to_install('import')}"
-        ) from error
-    return mf4
 
 
 def open_bag(path: Path) -> Bag:

@@ -399,8 +399,13 @@ from swath.drivers.transports.base import TransportError
 path, cut = Path(sys.argv[1]), Path(sys.argv[2])
 units = list(read_can_log(path, "mf4", FileClock(), CaptureTally()))
 whole, results = cut.read_bytes(), []
-for size in (64, 3000, 20_000, len(whole) - 1):
-    cut.write_bytes(whole[:size])
+pieces = [whole[:size] for size in (64, 3000, 20_000, len(whole) - 1)]
+for changes in json.loads(sys.argv[3]):
+    pieces.append(bytearray(whole[:20_000]))
+    for at, content in changes:
+        pieces[-1][at : at + len(content) // 2] = bytes.fromhex(content)
+for piece in pieces:
+    cut.write_bytes(piece)
     tally = CaptureTally()
     try:
         results.append([len(list(read_can_log(cut, "mf4", FileClock(), tally))), tally.damage, tally.first_damage])
@@ -410,13 +415,18 @@ print(json.dumps([can_log_time(path, "mf4").name, [(u.time_ns, u.channel, u.data
 """
 
 
+# changes of that file: addresses, and bytes that stand there instead; asammdf 8's compiled code ends at the first
+CRASHES = [(5642, "2c0f424c"), (5648, "0010"), (16812, "ffffffff")]
+GIGABYTES = [(1077, "feffffff"), (7227, "f87f"), (17200, "0100"), (17203, "7f")]
+
+
 def test_mf4_of_a_logger_is_read_as_its_candump_log(tmp_path: Path) -> None:
     """Both are recordings of the same minute; asammdf's times are floats, a nanosecond apart at most."""
     path = FIXTURES / "canmod-gps" / "2F6913DB_00000004_00000001.MF4.gz"
     assert can_log_kind(gzip.decompress(path.read_bytes())[:100]) == "mf4"
     (tmp_path / "cut.mf4").write_bytes(gzip.decompress(path.read_bytes()))
     done = subprocess.run(
-        [sys.executable, "-c", MF4, str(path), str(tmp_path / "cut.mf4")],
+        [sys.executable, "-c", MF4, str(path), str(tmp_path / "cut.mf4"), json.dumps([CRASHES, GIGABYTES])],
         env=os.environ | {"PYTHONPATH": str(ROOT)}, cwd=ROOT, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert (done.returncode, done.stderr) == (0, "")  # asammdf's own objects complain when they are removed
@@ -425,8 +435,11 @@ def test_mf4_of_a_logger_is_read_as_its_candump_log(tmp_path: Path) -> None:
     assert told == "UTC"
     assert [(f"can{channel}", data) for _, channel, data in units] == [(one.channel, one.data.hex()) for one in theirs]
     assert max(abs(time_ns - one.time_ns) for (time_ns, _, _), one in zip(units, theirs, strict=True)) <= 1
-    assert [(count, damage) for count, damage, _ in results] == [(-1, 1), (-1, 1), (149, 1), (5587, 1)]
-    assert all("\n" not in line and "cut.mf4: asammdf cannot read " in line for _, _, line in results)
+    counts = [(-1, 1), (-1, 1), (149, 1), (5587, 1), (0, 1), (0, 1)]
+    assert [(count, damage) for count, damage, _ in results] == counts
+    lines = [line.removeprefix(f"{tmp_path}/cut.mf4: ") for _, _, line in results]
+    assert all("\n" not in line and line.startswith("asammdf cannot read ") for line in lines[:5])
+    assert lines[5] == "the records of CAN_DataFrame are damaged: CAN_DataFrame.DataBytes has 234895360 bytes in one"
 
 
 def test_without_asammdf_the_extra_is_named(tmp_path: Path) -> None:
