@@ -109,21 +109,7 @@ def input_doubts(
     found: NavigationLog, sources: NavigationSources, times: ImuTimes, parts: Mapping[str, Observed], log: Path
 ) -> list[str]:
     lines = [f"{log}: {remark}" for remark in found.remarks]
-    if times.by == "arrival":
-        lines.append(
-            f"{log}: {sources.imu_source} sends no time: its samples are timed by their arrival, to about "
-            f"{times.sigma_s * 1e3:.1f} ms; the filter estimates an offset"
-        )
-    elif times.sigma_s > TIME_IS_KNOWN_S:
-        lines.append(
-            f"{log}: the times of {sources.imu_source} are good to {times.sigma_s * 1e3:.1f} ms only, so the "
-            "filter estimates an offset; let the IMU latch PPS edges"
-        )
-    if sources.gnss_source is None and times.by != "gps":
-        lines.append(
-            f"{log}: the host's wall clock alone names the seconds of {sources.clock}, because there is no receiver; "
-            "an error of this clock moves the trajectory along its track"
-        )
+    lines += time_doubts(sources, times, log)
     if not sources.arm_is_said:
         lines.append(
             f"{log}: the lever arm of the positions' antenna is unknown, so the filter estimates it, starting at 0 m; "
@@ -146,6 +132,28 @@ def input_doubts(
     lines += _silent_antenna(found, sources, log)
     lines += [f"{log}: the recorder lost {count:,} units of {source}" for source, count in sorted(found.lost.items())]
     lines += _baseline_doubts(found, sources, log)
+    return lines
+
+
+def time_doubts(sources: NavigationSources, times: ImuTimes, log: Path) -> list[str]:
+    """Return what is uncertain in the times of the samples, with its size, a line each."""
+    lines = []
+    if times.by == "arrival":
+        lines.append(
+            f"{log}: {sources.imu_source} sends no time: its samples are timed by their arrival, to about "
+            f"{times.sigma_s * 1e3:.1f} ms; the filter estimates an offset"
+        )
+    elif times.sigma_s > TIME_IS_KNOWN_S:
+        remedy = "" if sources.imu.protocol == "records" else "; let the IMU latch PPS edges"
+        lines.append(
+            f"{log}: the times of {sources.imu_source} are good to {times.sigma_s * 1e3:.1f} ms only, so the "
+            f"filter estimates an offset{remedy}"
+        )
+    if sources.gnss_source is None and times.by != "gps":
+        lines.append(
+            f"{log}: the host's wall clock alone names the seconds of {sources.clock}, because there is no receiver; "
+            "an error of this clock moves the trajectory along its track"
+        )
     return lines
 
 

@@ -603,3 +603,13 @@ def test_positions_of_the_same_time_or_another_place_are_not_reported_as_shifted
     outside = OutsidePositions(Path("a.pos"), Observed(flown_rows(later_s, north_m), Counter(), Counter()))
     refuse_shifted(outside, flown_rows())
     refuse_shifted(outside, flown_rows()[:3])
+
+
+@pytest.mark.parametrize(("protocol", "remedy"), [("xsens-mti", "; let the IMU latch PPS edges"), ("records", "")])
+def test_uncertain_times_are_told_with_what_would_help(protocol: str, remedy: str) -> None:
+    imu = SimpleNamespace(protocol=protocol)
+    sources: Any = SimpleNamespace(imu=imu, imu_source="imu/main", gnss_source="gnss/rover")
+    times: Any = SimpleNamespace(by="counter", sigma_s=0.0042)
+    assert input_checks.time_doubts(sources, times, Path("a.mcap")) == [
+        f"a.mcap: the times of imu/main are good to 4.2 ms only, so the filter estimates an offset{remedy}"
+    ]
