@@ -7,6 +7,8 @@ SECONDS ?= 600
 MINUTES ?= 60
 RATE ?= 0.1
 SEEDS ?= 5
+# how workers share the tests: tests/conftest.py says which belong together, and which begin
+SHARED := --dist loadgroup --no-loadscope-reorder
 # RESULTS: a folder for a JUnit file of each run, which .ci/run sums up
 PYTEST = $(BIN)/python -m pytest -p no:cacheprovider $(if $(RESULTS),--junitxml=$(RESULTS)/$@$(1).xml)
 
@@ -29,11 +31,11 @@ demo: $(VENV)/.flies ## record real recordings and a simulated flight over real 
 
 test: $(VENV)/.tests $(VENV)/.tools ## install what they need, then run style, types, import rules and tests
 	@$(MAKE) -j 2 --output-sync=target lint ready
-	$(PYTEST) -n $(JOBS) --dist loadgroup -m "not slow and not long and not alone and not peers"
+	$(PYTEST) -n $(JOBS) $(SHARED) -m "not slow and not long and not alone and not peers"
 	$(call PYTEST,-alone) -n 0 -m "alone and not slow and not long"
 
 test-slow: $(VENV)/.tests $(VENV)/.tools ready ## run the longer tests: whole flights and calibrations, the demo, the installation
-	$(PYTEST) -n $(JOBS) --dist loadgroup -m "slow and not long and not alone and not peers"
+	$(PYTEST) -n $(JOBS) $(SHARED) -m "slow and not long and not alone and not peers"
 	$(call PYTEST,-alone) -n 0 -m "alone and slow and not long"
 
 test-peers: $(VENV)/.tests ## run the tests against gpsd, Foxglove's reader and Chromium, which it installs (root, apt, npm)
@@ -55,7 +57,7 @@ test-vm-long: $(VENV)/.tests ## run the same with 50 power cuts and three minute
 test-arm64: $(VENV)/.tests ## compare decoders, log and points with an emulated ARM64, which it installs (root, apt)
 	@bash tests/arm64/setup.sh $(VENV)
 	$(PYTEST) -n 0 -v tests/arm64
-	tests/arm64/.cache/venv/bin/python -m tests.arm64 -n $(JOBS) --dist loadgroup
+	tests/arm64/.cache/venv/bin/python -m tests.arm64 -n $(JOBS) $(SHARED)
 
 test-long: $(VENV)/.tests $(VENV)/.tools ## run the tests that take minutes each
 	$(PYTEST) -n 0 -m long

@@ -12,15 +12,22 @@ import pytest
 
 TESTS = Path(__file__).parent
 LEAN = TESTS / "lean"
-# Files that take minutes on one worker, longest first: begun last, they would leave the other workers idle.
+# Groups and files that take minutes on one worker, longest first: begun last, they would leave the other workers idle.
 LONGEST = (
+    "kernels of georef",
     "daemon/cli/test_calibrate_cli.py",
+    "install",
     "test_office.py",
-    "georef/navigation/test_heading_noise.py",
-    "test_demo.py",
-    "georef/navigation/test_mounting.py",
+    "demo",
+    "daemon/cli/test_georef_judged.py",
+    "daemon/cli/test_plan_calibration.py",
     "calib/test_strip_functions.py",
+    "daemon/cli/test_interrupted.py",
     "daemon/monitor/test_monitor.py",
+    "calib/strips/test_signatures.py",
+    "daemon/cli/test_georef_cli.py",
+    "daemon/processing/strips/test_strips_adjust.py",
+    "replay",
 )
 
 
@@ -53,7 +60,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Give one worker to tests that share something made once: a fixture of their file, or loops to be compiled.
 
-    The longest files come first. `make test` compiles most loops beforehand, and all of calib. The rest is compiled
+    The longest come first; the option --no-loadscope-reorder of the Makefile keeps xdist from sorting them by their
+    numbers of tests. `make test` compiles most loops beforehand, and all of calib. The rest is compiled
     once for georef and once for sim; tests of whole commands find these in the cache, or compile them at the same time.
     """
     for item in items:
@@ -64,7 +72,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             package = item.path.relative_to(TESTS).parts[0]
             group = _name(item) if package in ("daemon", "calib") else f"kernels of {package}"
             item.add_marker(pytest.mark.xdist_group(group))
-    items.sort(key=lambda item: LONGEST.index(_name(item)) if _name(item) in LONGEST else len(LONGEST))
+    items.sort(key=_rank)
+
+
+def _rank(item: pytest.Item) -> int:
+    names = {_name(item), *(marker.args[0] for marker in item.iter_markers("xdist_group"))}
+    return next((rank for rank, name in enumerate(LONGEST) if name in names), len(LONGEST))
 
 
 def _name(item: pytest.Item) -> str:

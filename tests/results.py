@@ -1,4 +1,4 @@
-"""Sums up the JUnit files that pytest's runs left in a folder: the slowest tests, and one closing line.
+"""Sums up the JUnit files that pytest's runs left in a folder: the slowest tests, each run, and one closing line.
 
     python tests/results.py FOLDER
 
@@ -24,17 +24,18 @@ def outcome_of(case: ElementTree.Element) -> str:
 def summary(folder: Path) -> tuple[list[str], bool]:
     """Return the lines that sum up all runs of a folder, and whether all tests have passed."""
     counts: Counter[str] = Counter()
-    seconds = 0.0
+    runs: dict[str, float] = {}
     cases: list[tuple[float, str]] = []
     for path in sorted(folder.glob("*.xml")):
         for suite in ElementTree.parse(path).iter("testsuite"):
-            seconds += float(suite.get("time", 0.0))
+            runs[path.stem] = runs.get(path.stem, 0.0) + float(suite.get("time", 0.0))
             for case in suite.iter("testcase"):
                 counts[outcome_of(case)] += 1
                 cases.append((float(case.get("time", 0.0)), f"{case.get('classname')}::{case.get('name')}"))
     lines = [f"{time_s:7.1f} s  {name}" for time_s, name in sorted(cases, reverse=True)[:SLOWEST]]
+    lines += [f"{time_s:7.1f} s  in all: {name}" for name, time_s in runs.items()]
     words = [f"{counts[word]} {word}" for word in ("failed", "passed", "skipped", "error") if counts[word]]
-    lines.append(f"==== {', '.join(words) or 'no tests ran'} in {seconds:.2f}s ====")
+    lines.append(f"==== {', '.join(words) or 'no tests ran'} in {sum(runs.values()):.2f}s ====")
     return lines, counts["passed"] > 0 and not counts["failed"] and not counts["error"]
 
 

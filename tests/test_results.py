@@ -48,6 +48,7 @@ def test_outcomes_of_several_runs_are_added(tmp_path: Path, bad: str, error: str
     run_tests(tmp_path, "second", TESTS.format(bad="True", error=""))
     lines, passed = summary(tmp_path)
     assert lines[-1].startswith(line)
+    assert [one.split()[-1] for one in lines if " in all: " in one] == ["first", "second"]
     assert passed == good
 
 
