@@ -37,6 +37,7 @@ SHARED_OF_GEOREF = {
 # Modules outside the command line that import within functions, and what they import: an extra, or a module that is
 # slow to load and not needed by all users of the importing module.
 IMPORTED_LATE = {
+    "swath.daemon.console.rasters": {"rasterio"},
     "swath.daemon.log.directory": {"swath.daemon.config"},  # pydantic; commands given a folder read no configuration
     # matplotlib, Jinja2 and WeasyPrint, with --report only
     "swath.daemon.processing.calibration.products": {

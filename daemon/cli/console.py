@@ -40,6 +40,10 @@ def command(
         bool, typer.Option("--replay", help="Show finished logs as in flight: for training and debriefing.")
     ] = False,
     pace: Annotated[float, typer.Option(help="--replay: times as fast as it was.", min=0.1, max=1000.0)] = 1.0,
+    background: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Map behind the painted one, instead of `[console] background`."),
+    ] = None,
     viewer: Annotated[bool, typer.Option("--viewer", help="pair: show the token of those who may only look.")] = False,
 ) -> None:
     """Serve the operator's console: pages in a browser that show whether everything records and the strips are good.
@@ -47,8 +51,9 @@ def command(
     Reads what `swath run` and `swath live` write, and asks the recorder for marks and new parts only. It listens on
     this computer alone unless another address is given; then pages need a token, which `swath console pair` shows.
     """
-    require_installed("swath console", "starlette", "uvicorn", "xstatic", "cryptography", "segno")
+    require_installed("swath console", "starlette", "uvicorn", "xstatic", "cryptography", "segno", "PIL", "pmtiles")
     from swath.daemon.config.tables import ConsoleConfig
+    from swath.daemon.console.rasters import open_raster
     from swath.daemon.console.serve import pairing_text, serve
     from swath.daemon.processing.live.session import FOLDER
 
@@ -59,21 +64,25 @@ def command(
     if len(words) > 1 and not replay:
         raise UserError("too many arguments; give one CONFIG or DIR", ExitCode.USAGE)
     if replay:
-        _replay([Path(word) for word in words], listen, pace)
+        _replay([Path(word) for word in words], listen, pace, background)
         return
     path = Path(words[0]) if words else DEFAULT_CONFIG
     config = ConsoleConfig()
     if path.is_file():
         from swath.daemon.config import load_config
 
-        config = load_config(path).tables.console
+        loaded = load_config(path)
+        config = loaded.tables.console
+        if background is None and config.background is not None:
+            background = loaded.resolve(config.background)
     place = _place(listen, config)
     if pairs:
         print(pairing_text(place, config, viewer=viewer))
         return
     directory = log_directory(path)
+    raster = None if background is None else open_raster(background)
     print(place.url, flush=True)
-    serve(directory, directory / FOLDER, config, place)
+    serve(directory, directory / FOLDER, config, place, background=raster)
 
 
 def _place(listen: str | None, config: ConsoleConfig) -> Place:
@@ -85,9 +94,10 @@ def _place(listen: str | None, config: ConsoleConfig) -> Place:
         raise UserError(f"--listen: {error}", ExitCode.USAGE) from error
 
 
-def _replay(paths: list[Path], listen: str | None, pace: float) -> None:
+def _replay(paths: list[Path], listen: str | None, pace: float, background: Path | None) -> None:
     """Let logs grow again in a temporary folder, beside `swath live`, and serve that."""
     from swath.daemon.config.tables import ConsoleConfig
+    from swath.daemon.console.rasters import open_raster
     from swath.daemon.console.replaying import GrowingCopy
     from swath.daemon.console.serve import serve
     from swath.daemon.console.watch import LIVE_STATUS
@@ -99,6 +109,7 @@ def _replay(paths: list[Path], listen: str | None, pace: float) -> None:
         raise UserError("--replay needs logs: swath console --replay LOG…", ExitCode.USAGE)
     config = ConsoleConfig()
     place = _place(listen, config)
+    raster = None if background is None else open_raster(background)
     with as_user_error(paths[0]):
         sessions = open_logs(paths)
     if len(sessions) > 1:
@@ -114,7 +125,7 @@ def _replay(paths: list[Path], listen: str | None, pace: float) -> None:
         try:
             print(place.url, flush=True)
             growing.start()
-            serve(directory, directory / FOLDER, config, place, asks=False)
+            serve(directory, directory / FOLDER, config, place, asks=False, background=raster)
         finally:
             growing.close()
             live.terminate()

@@ -575,6 +575,7 @@ class ConsoleConfig(Section):
     marks: list[Annotated[str, Field(min_length=1, max_length=80)]] = Field(
         default_factory=list, max_length=8, description="texts of the marks of the keys F1 to F8"
     )
+    background: Text | None = Field(None, description="map behind the painted one: MBTiles, PMTiles or GeoTIFF")
 
 
 class Tables(Section):

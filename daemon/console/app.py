@@ -108,6 +108,7 @@ class Pages:
             Route("/history", self.history),
             Route("/about", self.about),
             Route("/tiles/{layer}/{square:path}", self.tile),
+            Route("/background/{square:path}", self.background),
             Route("/look/{name}", self.look),
             Route("/mark", self.mark, methods=["POST"]),
             Route("/split", self.split, methods=["POST"]),
@@ -153,6 +154,17 @@ class Pages:
             return _missing()
         picture = await run_in_threadpool(self._watch.painter.picture, layer, *place)
         return Response(picture, media_type="image/png", headers={"cache-control": "no-cache"})
+
+    async def background(self, request: Request) -> Response:
+        """Return a square of the user's map behind live's."""
+        place = _square(request.path_params["square"])
+        if self._watch.background is None or place is None:
+            return _missing()
+        picture = await run_in_threadpool(self._watch.background.picture, *place)
+        if picture is None:
+            return Response(status_code=204)
+        kind = "image/png" if picture.startswith(b"\x89PNG") else "image/jpeg"
+        return Response(picture, media_type=kind, headers={"cache-control": "max-age=3600"})
 
     async def look(self, request: Request) -> Response:
         """Return the profile or the last minute's points, unless the page has them already."""

@@ -52,6 +52,7 @@ class Painter:
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _kept: OrderedDict[tuple[Any, ...], bytes] = field(default_factory=OrderedDict)
     _heights: tuple[int, tuple[float, float]] = (-1, (0.0, 1.0))
+    _placed: tuple[Any, Placement | None] = (None, None)
 
     def __post_init__(self) -> None:
         self._reader = TileReader(self.folder)
@@ -61,7 +62,7 @@ class Painter:
 
         None: the map's place is not known.
         """
-        placement = Placement.of(self._reader.index)
+        placement = self.placement
         if placement is None:
             return None
 
@@ -74,6 +75,14 @@ class Painter:
             "lines": {name: placed(places) for name, places in geometry["lines"].items()},
             "area": [[placed(ring) for ring in polygon] for polygon in geometry["area"]],
         }
+
+    @property
+    def placement(self) -> Placement | None:
+        """Where the map lies on the earth, the same object while it stays there; None: not known."""
+        said = self._reader.index.get("placement")
+        if said != self._placed[0]:
+            self._placed = said, Placement.of(self._reader.index)
+        return self._placed[1]
 
     @property
     def generation(self) -> int:

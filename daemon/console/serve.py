@@ -24,6 +24,8 @@ from swath.daemon.config.listen import Place
 from swath.daemon.config.tables import ConsoleConfig
 from swath.daemon.console.access import OPERATOR, VIEWER, Access, read_tokens
 from swath.daemon.console.app import make_app
+from swath.daemon.console.background import Background
+from swath.daemon.console.rasters import Raster
 from swath.daemon.console.watch import Watch
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.recorder.service_manager import ServiceManager
@@ -146,7 +148,15 @@ class _Protocol(H11Protocol):
             self.transport.close()
 
 
-def serve(directory: Path, live: Path, config: ConsoleConfig, place: Place, *, asks: bool = True) -> None:
+def serve(
+    directory: Path,
+    live: Path,
+    config: ConsoleConfig,
+    place: Place,
+    *,
+    asks: bool = True,
+    background: Raster | None = None,
+) -> None:
     """Serve until a signal comes; with ``asks`` False, no recorder is asked for anything.
 
     Raises:
@@ -162,6 +172,8 @@ def serve(directory: Path, live: Path, config: ConsoleConfig, place: Place, *, a
         tokens = read_tokens(folder)
         key, chain = certificate(folder, names)
     watch = Watch(directory, live)
+    if background is not None:
+        watch.background = Background(background, lambda: watch.painter.placement)
     app, feed = make_app(watch, Access(tokens), directory if asks else None, config, names, secure=not place.is_local)
     sock = _bound(place)
     settings = uvicorn.Config(
@@ -188,6 +200,8 @@ def serve(directory: Path, live: Path, config: ConsoleConfig, place: Place, *, a
     finally:
         watch.close()
         sock.close()
+        if background is not None:
+            background.close()
 
 
 def _bound(place: Place) -> socket.socket:

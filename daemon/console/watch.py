@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from swath.daemon.console.background import Background
 from swath.daemon.console.painting import Painter
 from swath.daemon.monitor.display import DEGRADED, NOT_RECORDING, RECORDING, Monitor, follower_of, news
 
@@ -114,6 +115,7 @@ class Watch(threading.Thread):
         super().__init__(name="watch", daemon=True)
         self.latest: Plain = {}
         self.painter = Painter(live)
+        self.background: Background | None = None
         self._follower, self._monitor = follower_of(directory), Monitor(directory)
         self.steering: Plain = {}
         self._live, self._lines = JsonFile(live / LIVE_STATUS), JsonFile(live / LIVE_LINES)
@@ -172,6 +174,7 @@ class Watch(threading.Thread):
             "legend": self.painter.legend(),
             "drawn": self._drawn(lines),
             "extent_m": self.painter.extent_m,
+            "background": None if self.background is None else self.background.plain(),
         }
         series = series_of(found, live if is_live else None)
         snapshot["series"] = series

@@ -22,6 +22,8 @@ EXTRA_OF = {
     "xstatic": "console",
     "cryptography": "console",
     "segno": "console",
+    "PIL": "console",
+    "pmtiles": "console",
 }  # package: the extra that installs it, if not process
 
 

@@ -17,12 +17,15 @@ from axe_playwright_python.sync_playwright import Axe
 from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Browser, Page, expect, sync_playwright
+from pyproj import Transformer
 
 from swath.daemon.console.painting import RAMPS
+from swath.daemon.processing.live.frame import LocalFrame
 from swath.daemon.processing.live.look import RECENT_DTYPE, RECENT_HEAD
 from swath.daemon.processing.live.tiles import SIDE
-from tests.daemon.console.builders import Asked, console, write_map
+from tests.daemon.console.builders import WEB_ZOOM, WORLD_M, Asked, colours_of, console, write_map, write_mbtiles
 from tests.daemon.log_check import read_log
+from tests.daemon.processing.live.builders import Utm, flight
 from tests.daemon.rig import Recorder, free_udp_port, session_table, wait_until
 
 pytestmark = pytest.mark.peers
@@ -130,6 +133,16 @@ def recent_points() -> bytes:
     return RECENT_HEAD.pack(b"SWTR", 1, RECENT_HEAD.size, rows.itemsize, len(rows), 0) + rows.tobytes()
 
 
+def zoom_to(page: Page, scale: str) -> None:
+    """Change the zoom by its button until the scale bar has a length."""
+    bar = page.locator(".leaflet-control-scale-line")
+    for _ in range(20):  # a click while the map still moves has no effect
+        if bar.text_content() == scale:
+            break
+        page.get_by_role("button", name="Zoom in").click()
+        page.wait_for_timeout(700)
+
+
 def keep_current(live: Path) -> None:
     """Give live's status a new time, as live does each second."""
     (live / "live.json").touch()
@@ -192,12 +205,7 @@ def test_every_cell_is_painted_and_nothing_else(
     asked, _ = aircraft
     page = open_page(asked.url, size).page
     page.get_by_label("Show").select_option("density")
-    scale = page.locator(".leaflet-control-scale-line")
-    for _ in range(20):  # a click while the map still moves has no effect
-        if scale.text_content() == SCALE:
-            break
-        page.get_by_role("button", name="Zoom in").click()
-        page.wait_for_timeout(700)
+    zoom_to(page, SCALE)
     colour = np.array([int(RAMPS["density"][2][i : i + 2], 16) for i in (1, 3, 5)])
     pixel_m = 0.25
     wanted = (CELLS / pixel_m) ** 2
@@ -265,6 +273,63 @@ def test_a_page_without_its_console_says_so_and_is_whole_again(
         expect(page.locator("#sentence")).to_contain_text("is not known here")
     with console(tmp_path, port=asked.port):
         expect(page.locator("#state")).to_have_text("NOT RECORDING", timeout=WAIT_MS)
+
+
+def test_the_user_s_map_lies_behind_where_proj_places_it(tmp_path: Path, open_page: Callable[..., Opened]) -> None:
+    """The colours of the made-up map tell their place, to two pixels of a screen's picture."""
+    frame = LocalFrame(flight().position_e[0], Utm())
+    live = tmp_path / "live"
+    write_map(live, {(3, 3): {"points": np.ones((SIDE, SIDE), np.uint32)}}, placement=frame.placement())
+    pose = {"east_m": 0.0, "north_m": 0.0, "heading_deg": 30.0, "track_deg": 30.0}
+    (live / "live.json").write_text(json.dumps({"state": "following", "pose": pose}))
+    write_mbtiles(tmp_path / "map", frame)
+    with console(tmp_path, "--background", tmp_path / "map") as (asked, _):
+        opened = open_page(asked.url, SIZES[1])
+        page = opened.page
+        expect(page.locator("#attribution")).to_have_text("© Maps", timeout=WAIT_MS)
+        zoom_to(page, "100 m")  # at a pixel a metre
+        page.wait_for_timeout(3000)
+        shot = np.asarray(Image.open(io.BytesIO(page.locator("#map").screenshot())).convert("RGB"), float)
+        rows, columns = (length // 2 for length in shot.shape[:2])
+        down, across = (grid.ravel() for grid in np.mgrid[-100:100:9, -100:100:9])
+        free = np.hypot(across, down) > 40  # beside the aircraft
+        x, y = Transformer.from_crs("EPSG:32632", "EPSG:3857").transform(
+            frame.origin[0] + across[free] + 0.5, frame.origin[1] - down[free] - 0.5
+        )
+        place = [(0.5 + one / WORLD_M) * (256 << WEB_ZOOM) - 0.5 for one in (x, -y)]
+        error = np.abs(shot[rows + down[free], columns + across[free]] - colours_of(*place))[:, :2]
+        assert np.quantile(error, 0.95) < 2.0
+        assert error.max() < 3.0
+        assert page.locator("#grid-step").text_content() == ""
+        page.get_by_role("button", name="Background").click()
+        expect(page.locator("#grid-step")).to_have_text("grid 100 m")
+        page.wait_for_timeout(1000)
+        assert opened.errors == []
+
+
+def test_grid_and_north_are_right_when_the_track_is_up(
+    aircraft: tuple[Asked, Path], open_page: Callable[..., Opened]
+) -> None:
+    """The aircraft flies east: north is to the left, and upright lines of the grid are 50 m of 4 pixels apart."""
+    asked, logs = aircraft
+    keep_current(logs / "live")
+    page = open_page(asked.url, SIZES[2]).page
+    zoom_to(page, SCALE)
+    buttons = {name: page.locator(name).bounding_box() for name in ("#zoom-in", "#scale", "#legend")}
+    page.get_by_role("button", name="Track up").click()
+    page.wait_for_timeout(2500)
+    expect(page.locator("#grid-step")).to_have_text("grid 50 m")
+    assert {name: page.locator(name).bounding_box() for name in buttons} == buttons  # nothing but the map turns
+    angle = page.locator("#north").evaluate("(one) => new DOMMatrix(getComputedStyle(one).transform)")
+    assert (round(angle["a"]), round(angle["b"])) == (0, -1)  # a quarter to the left
+    shot = np.asarray(Image.open(io.BytesIO(page.locator("#map-section").screenshot())).convert("RGB"), int)
+    middle = np.array(shot.shape[:2]) // 2
+    below = shot[middle[0] + 100 : middle[0] + 150]  # of the painted square
+    darker = (np.median(below, axis=(0, 1)) - below).sum(axis=-1).mean(axis=0)
+    lines = np.flatnonzero((darker > 10.0) & (darker >= np.roll(darker, 1)) & (darker > np.roll(darker, -1)))
+    assert len(lines) >= 3
+    assert np.diff(lines).tolist() == pytest.approx([200.0] * (len(lines) - 1), abs=1.0)
+    assert np.abs(lines - (middle[1] + 80)).min() <= 1  # the aircraft is 20 m north of a line, which lies to its right
 
 
 def pixels_of(page: Page, canvas: str) -> NDArray[np.uint8]:

@@ -5,7 +5,10 @@ import { listen, number, text } from "./feed.js";
 const TILE = 256;
 const LINE_COLOURS = { planned: "#5b6770", flying: "#0072b2", good: "#00598c", remarks: "#b36200", again: "#d7191c" };
 const $ = (id) => document.getElementById(id);
-let map, painted, aircraft, trail, plan;
+const GRID_PIXELS = 90; // between two lines of the grid, at least
+let map, painted, aircraft, trail, plan, behind, grid;
+let origin = [0, 0]; // of the frame in metres of its coordinate system, which the grid's lines are counted in
+let place = null; // of the background
 let drawn = "";
 let placed = false;
 let sequence = -1;
@@ -28,6 +31,66 @@ function makeTiles() {
 }
 
 const address = (where) => `/tiles/${$("layer").value}/${where.z}/${where.x}/${where.y}.png?s=${sequence}`;
+
+// The user's map; its squares lie as those of the painted one.
+function makeBackground() {
+  const Behind = L.GridLayer.extend({
+    createTile(where, done) {
+      const image = document.createElement("img");
+      image.alt = "";
+      image.onload = image.onerror = () => done(null, image);
+      image.src = `/background/${where.z}/${where.x}/${where.y}.png?s=${place}`;
+      return image;
+    },
+  });
+  return new Behind({ tileSize: TILE, minZoom: -7, maxZoom: 3, updateWhenZooming: false, pane: "behind" });
+}
+
+function gridStep(zoom) {
+  const least = GRID_PIXELS / 2 ** zoom;
+  const size = 10 ** Math.floor(Math.log10(least));
+  return size * [1, 2, 5, 10].find((times) => times * size >= least);
+}
+
+function makeGrid() {
+  const Lines = L.GridLayer.extend({
+    createTile(where) {
+      const square = document.createElement("canvas");
+      square.width = square.height = TILE;
+      const pen = square.getContext("2d");
+      pen.fillStyle = getComputedStyle(document.documentElement).getPropertyValue("--grid");
+      const step = gridStep(where.z);
+      const pixels = step * 2 ** where.z;
+      const first = (at, shift) => Math.ceil((at + shift) / pixels) * pixels - shift - at;
+      const [east, north] = origin.map((metres) => (metres % step) * 2 ** where.z);
+      for (let x = first(where.x * TILE, east); x < TILE; x += pixels) pen.fillRect(Math.round(x), 0, 1, TILE);
+      for (let y = first(where.y * TILE, -north); y < TILE; y += pixels) pen.fillRect(0, Math.round(y), TILE, 1);
+      return square;
+    },
+  });
+  return new Lines({ tileSize: TILE, minZoom: -7, maxZoom: 3, updateWhenZooming: false, pane: "behind" });
+}
+
+function showBehind(found) {
+  const shown = found.background;
+  const live = found.live;
+  const counted = Array.isArray(live.origin) && !String(live.crs).includes("4978") ? [0, 1].map((axis) => live.origin[axis] * live.origin_unit_m[axis]) : [0, 0];
+  if (counted[0] !== origin[0] || counted[1] !== origin[1]) {
+    origin = counted;
+    grid.redraw();
+  }
+  $("background").hidden = !shown;
+  const wanted = shown && shown.place !== null && $("background").getAttribute("aria-pressed") === "true";
+  if (wanted && shown.place !== place) {
+    place = shown.place;
+    behind.redraw();
+  }
+  for (const [layer, is] of [[behind, wanted], [grid, !wanted]]) if (map.hasLayer(layer) !== Boolean(is)) is ? map.addLayer(layer) : map.removeLayer(layer);
+  text("attribution", wanted ? shown.attribution : "");
+  showGridStep();
+}
+
+const showGridStep = () => text("grid-step", map.hasLayer(grid) ? `grid ${number(gridStep(map.getZoom()), gridStep(map.getZoom()) < 1 ? 1 : 0)} m` : "");
 
 function refresh() {
   for (const tile of Object.values(painted._tiles)) {
@@ -136,15 +199,23 @@ function showLegend(legend) {
 export function startMap() {
   map = L.map("map", { crs: L.CRS.Simple, minZoom: -7, maxZoom: 3, zoomControl: false, attributionControl: false, touchZoom: "center", renderer: L.canvas({ padding: 0.5 }) });
   map.setView([0, 0], -2);
+  new ResizeObserver(() => map.invalidateSize({ animate: false })).observe($("map")); // also when the header grows
   const scale = L.control.scale({ imperial: false, maxWidth: 160 }).addTo(map);
   $("scale").append(scale.getContainer()); // beside the map, which may be turned
   $("zoom-in").addEventListener("click", () => map.zoomIn());
   $("zoom-out").addEventListener("click", () => map.zoomOut());
+  map.createPane("behind").style.zIndex = 150;
+  behind = makeBackground();
+  grid = makeGrid().addTo(map);
+  map.on("zoomend", showGridStep);
+  new MutationObserver(() => grid.redraw()).observe(document.documentElement, { attributeFilter: ["data-night"] });
   painted = makeTiles().addTo(map);
   plan = L.layerGroup().addTo(map);
   const toggle = (id) => $(id).addEventListener("click", () => $(id).setAttribute("aria-pressed", String($(id).getAttribute("aria-pressed") !== "true")));
   toggle("follow");
   toggle("track-up");
+  toggle("background");
+  $("background").addEventListener("click", () => listen(showBehind, { once: true }));
   map.on("dragstart", () => $("follow").setAttribute("aria-pressed", "false"));
   $("track-up").addEventListener("click", () => $("follow").setAttribute("aria-pressed", "true"));
   $("layer").addEventListener("change", () => painted.redraw());
@@ -155,6 +226,7 @@ export function startMap() {
       map.fitBounds([at(west, south), at(east, north)]);
       placed = true;
     }
+    showBehind(found);
     drawPlan(found);
     showLegend(found.legend);
     const next = found.live.tiles?.sequence ?? -1;
@@ -162,6 +234,6 @@ export function startMap() {
       sequence = next;
       refresh();
     }
-    text("map-note", found.live_is_current || found.live.state ? "" : "swath live does not run: no map");
+    text("map-note", found.live_is_current || found.live.state ? found.background?.trouble ?? "" : "swath live does not run: no map");
   });
 }

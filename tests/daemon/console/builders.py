@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import http.client
+import io
 import json
+import math
 import select
 import socket
+import sqlite3
 import ssl
 import subprocess
 import time
@@ -17,10 +20,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
+from pyproj import Transformer
 
+from swath.daemon.processing.live.frame import LocalFrame
 from swath.daemon.processing.live.tiles import SIDE, STORED, TileFolder, pack_tile
 from tests.builders import running
 from tests.daemon.rig import HANGS_S
+
+WEB_ZOOM, WEB_REACH = 17, 3  # of the tiles of a made-up map, and how many there are to each side of a frame's origin
+WORLD_M = 2.0 * math.pi * 6_378_137.0
+FOLD = 250  # a colour rises by one a pixel up to here, and falls again
 
 
 @dataclass
@@ -132,3 +142,43 @@ def write_map(
         (place, lambda head, layers=layers: pack_tile(head, nothing | dict(layers))) for place, layers in tiles.items()
     ]
     TileFolder(live).write(made, {"cell_m": cell_m} | about)
+
+
+def colours_of(columns: NDArray[np.float64], rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a colour (…, 3) that tells a pixel's place by a slope of one a pixel."""
+    return np.stack([np.abs((one + FOLD) % (2 * FOLD) - FOLD) for one in (columns, rows, columns + rows)], axis=-1)
+
+
+def web_tiles(frame: LocalFrame) -> dict[tuple[int, int], NDArray[np.uint8]]:
+    """Return the tiles around the frame's origin by column and row from the north-west."""
+    x, y = Transformer.from_crs("EPSG:32632", "EPSG:3857").transform(*frame.origin[:2])
+    middle = [math.floor((0.5 + one / WORLD_M) * (1 << WEB_ZOOM)) for one in (x, -y)]
+    made = {}
+    for column in range(middle[0] - WEB_REACH, middle[0] + WEB_REACH + 1):
+        for row in range(middle[1] - WEB_REACH, middle[1] + WEB_REACH + 1):
+            across, down = np.meshgrid(256 * column + np.arange(256.0), 256 * row + np.arange(256.0))
+            made[column, row] = colours_of(across, down).astype(np.uint8)
+    return made
+
+
+def as_file(pixels: NDArray[np.uint8], kind: str) -> bytes:
+    """Return pixels (rows, columns, 3) as a file of a kind, without loss."""
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(
+        file, kind, **({"lossless": True, "exact": True, "method": 0} if kind == "WEBP" else {})
+    )
+    return file.getvalue()
+
+
+def write_mbtiles(
+    path: Path, frame: LocalFrame, kind: str = "png", attribution: str = "<a href='x'>© Maps</a>"
+) -> None:
+    """Write a database of tiles whose colours tell their place by `colours_of`."""
+    with sqlite3.connect(path) as base:
+        base.execute("CREATE TABLE metadata (name text, value text)")
+        base.execute("CREATE TABLE tiles (zoom_level integer, tile_column integer, tile_row integer, tile_data blob)")
+        base.executemany("INSERT INTO metadata VALUES (?, ?)", [("format", kind), ("attribution", attribution)])
+        for (column, row), pixels in web_tiles(frame).items():
+            data = as_file(pixels, "PNG") if kind == "png" else b"\x1f\x8b\x08 of vectors"
+            base.execute("INSERT INTO tiles VALUES (?, ?, ?, ?)", (WEB_ZOOM, column, (1 << WEB_ZOOM) - 1 - row, data))
+    base.close()
