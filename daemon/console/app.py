@@ -9,25 +9,25 @@ import re
 from collections.abc import AsyncIterator
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import Request
 from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import Route
 from xstatic.pkg import leaflet
 
 from swath.daemon.config.tables import ConsoleConfig
 from swath.daemon.console.access import Access
-from swath.daemon.console.guard import COOKIE, Guard, cookie_of
+from swath.daemon.console.guard import COOKIE, Guard, asked, cookie_of
+from swath.daemon.console.landing import Landing
 from swath.daemon.console.painting import RAMPS, ZOOMS
 from swath.daemon.console.watch import Watch
 from swath.daemon.errors import UserError, one_line
 from swath.daemon.recorder.control import NOTE_CHARACTERS
 from swath.daemon.recorder.control_client import ask
 
-PAGES = {"/": "console.html", "/pilot": "pilot.html", "/login": "login.html"}
+PAGES = {"/": "console.html", "/pilot": "pilot.html", "/landing": "landing.html", "/login": "login.html"}
 TYPES = {
     ".js": "text/javascript",
     ".css": "text/css",
@@ -97,6 +97,7 @@ class Pages:
     def __init__(self, watch: Watch, access: Access, directory: Path | None, config: ConsoleConfig) -> None:
         self._watch, self._access, self._directory, self._config = watch, access, directory, config
         self.feed = Feed(watch)
+        self._landing = Landing(watch, self._ask)
 
     def routes(self) -> list[Route]:
         """Return what can be asked."""
@@ -110,6 +111,7 @@ class Pages:
             Route("/tiles/{layer}/{square:path}", self.tile),
             Route("/background/{square:path}", self.background),
             Route("/look/{name}", self.look),
+            *self._landing.routes(),
             Route("/mark", self.mark, methods=["POST"]),
             Route("/split", self.split, methods=["POST"]),
             Route("/session", self.begin_session, methods=["POST"]),
@@ -180,7 +182,7 @@ class Pages:
 
     async def mark(self, request: Request) -> Response:
         """Write a mark into the log."""
-        text = (await _asked(request)).get("text")
+        text = (await asked(request)).get("text")
         if not isinstance(text, str) or not text.strip() or len(text) > NOTE_CHARACTERS or not text.isprintable():
             return JSONResponse({"error": f"a mark has 1 to {NOTE_CHARACTERS} printable characters"}, 400)
         return await self._ask({"command": "mark", "text": text})
@@ -206,7 +208,7 @@ class Pages:
         address = request.client.host if request.client else ""
         if self._access.must_wait(address):
             return JSONResponse({"error": "too many wrong tokens; wait a minute"}, 429)
-        token = (await _asked(request)).get("token")
+        token = (await asked(request)).get("token")
         cookie = self._access.open_session(token if isinstance(token, str) else "", address)
         if cookie is None:
             return JSONResponse({"error": "this token is not known: swath console pair shows the right one"}, 401)
@@ -221,15 +223,6 @@ class Pages:
         answer = JSONResponse({"ok": True})
         answer.delete_cookie(COOKIE, path="/")
         return answer
-
-
-async def _asked(request: Request) -> dict[str, Any]:
-    """Return the request's JSON object; empty if it is none."""
-    try:
-        asked = json.loads(await request.body())
-    except (ValueError, RecursionError, ClientDisconnect):
-        return {}
-    return asked if isinstance(asked, dict) else {}
 
 
 def _square(text: str) -> tuple[int, int, int] | None:

@@ -14,6 +14,7 @@ from typing import Any
 from swath.daemon.console.background import Background
 from swath.daemon.console.painting import Painter
 from swath.daemon.monitor.display import DEGRADED, NOT_RECORDING, RECORDING, Monitor, follower_of, news
+from swath.daemon.processing.landing.command import VERDICT
 
 EVERY_S = 1.0
 STEERING_S = 0.2  # live writes it five times a second
@@ -41,6 +42,11 @@ class JsonFile:
     age_s: float = float("inf")
     _read: tuple[int, int] = (-1, -1)
     _content: Plain | None = None
+
+    @property
+    def sign(self) -> str:
+        """A text that changes when the file does."""
+        return "-".join(f"{number:x}" for number in self._read)
 
     def content(self) -> Plain | None:
         """Return the newest readable content; None if there is no such file."""
@@ -120,13 +126,14 @@ class Watch(threading.Thread):
         self.steering: Plain = {}
         self._live, self._lines = JsonFile(live / LIVE_STATUS), JsonFile(live / LIVE_LINES)
         self._steering = JsonFile(live / LIVE_STEERING)
+        self.live, self._verdict = live, JsonFile(live / VERDICT)
         self.looks = {name: LookFile(live / file, kind) for name, (file, kind) in LOOKS.items()}
         self.tell = tell
         self._events = Numbered()
         self._session: str | None = None
         self._geometry: tuple[tuple[str, int], Plain | None] = (("", 0), None)
         self._history: deque[tuple[int, dict[str, float]]] = deque(maxlen=HISTORY_S)
-        self._ended = threading.Event()
+        self._ended, self._reading = threading.Event(), threading.Lock()
 
     def run(self) -> None:
         """Read until `close`: all once a second, how to steer as often as live tells it."""
@@ -171,6 +178,7 @@ class Watch(threading.Thread):
             "live": live or {},
             "live_is_current": is_live,
             "lines": lines or {},
+            "landing": self._landing(),
             "legend": self.painter.legend(),
             "drawn": self._drawn(lines),
             "extent_m": self.painter.extent_m,
@@ -180,6 +188,19 @@ class Watch(threading.Thread):
         snapshot["series"] = series
         self._history.append((now_ms, series))
         self.latest = snapshot
+
+    def verdict(self) -> tuple[Plain | None, str]:
+        """Return live's newest verdict before landing, and its sign, which changes with it; None, no sign: none."""
+        with self._reading:
+            content = self._verdict.content()
+            return content, "" if content is None else self._verdict.sign
+
+    def _landing(self) -> Plain | None:
+        """Return the verdict in short, for every page."""
+        content, sign = self.verdict()
+        if content is None:
+            return None
+        return {"sign": sign, "state": str(content.get("state")), "sentence": str(content.get("sentence"))}
 
     def _drawn(self, lines: Plain | None) -> Plain | None:
         """Return lines and area in metres of the map's frame; None: there are none, or the map's place is not known."""

@@ -23,7 +23,16 @@ from swath.daemon.console.painting import RAMPS
 from swath.daemon.processing.live.frame import LocalFrame
 from swath.daemon.processing.live.look import RECENT_DTYPE, RECENT_HEAD
 from swath.daemon.processing.live.tiles import SIDE
-from tests.daemon.console.builders import WEB_ZOOM, WORLD_M, Asked, colours_of, console, write_map, write_mbtiles
+from tests.daemon.console.builders import (
+    WEB_ZOOM,
+    WORLD_M,
+    Asked,
+    colours_of,
+    console,
+    verdict,
+    write_map,
+    write_mbtiles,
+)
 from tests.daemon.log_check import read_log
 from tests.daemon.processing.live.builders import Utm, flight
 from tests.daemon.rig import Recorder, free_udp_port, session_table, wait_until
@@ -121,6 +130,7 @@ def write_live(live: Path) -> None:
                 "to_end_m": 1200.0, "to_begin_s": None, "to_end_s": 24.0, "speed_mps": 50.0, "wanted_speed_mps": 52.0,
                 "bank_deg": 3.0, "bank_limit_deg": 20.0}  # fmt: skip
     (live / "lines.json").write_text(json.dumps({"lines": [flying, again], "current": "4", "next": "9"}))
+    (live / "verdict.json").write_text(json.dumps(verdict(note=SCRIPT)))
     (live / "steering.json").write_text(json.dumps({"current": "4", "next": "9", "steering": steering}))
 
 
@@ -189,7 +199,7 @@ def test_no_page_asks_another_machine_or_breaks_the_policy(
     aircraft: tuple[Asked, Path], open_page: Callable[..., Opened]
 ) -> None:
     asked, _ = aircraft
-    for path in ("/", "/pilot", "/login"):
+    for path in ("/", "/pilot", "/landing", "/login"):
         opened = open_page(asked.url + path)
         opened.page.wait_for_timeout(2500)
         assert {urlsplit(address).netloc for address in opened.asked if not address.startswith(("data:", "blob:"))} == {
@@ -233,7 +243,7 @@ def test_every_cell_is_painted_and_nothing_else(
     assert abs(columns.mean() - frame["width"] / 2) < 3.0
 
 
-@pytest.mark.parametrize("path", ["/", "/#data", "/pilot", "/login"])
+@pytest.mark.parametrize("path", ["/", "/#data", "/pilot", "/landing", "/login"])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_no_barrier_is_found(
     aircraft: tuple[Asked, Path], open_page: Callable[..., Opened], path: str, scheme: str
@@ -432,3 +442,55 @@ def test_the_overlap_is_told_against_the_quality_level_wanted(data_panel: Page) 
         "Strip 3: median −1.2 cm, RMSDz 9.3 cm in 1,200 cells, BEYOND QL2 (8.0 cm)", timeout=WAIT_MS
     )
     expect(data_panel.locator("#overlap-rows tr")).to_contain_text(["2 − 3"])
+
+
+def marks_of(logs: Path) -> list[str]:
+    """Return the texts of all marks in the logs."""
+    logged = [read_log(path).events("mark") for path in sorted(logs.glob("*.mcap"))]
+    return [event["text"] for events in logged for event in events]
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_verdict_before_landing_is_read_printed_and_written_into_the_log(
+    aircraft: tuple[Asked, Path], open_page: Callable[..., Opened], size: tuple[int, int]
+) -> None:
+    asked, logs = aircraft
+    keep_current(logs / "live")
+    opened = open_page(asked.url + "/landing", size)
+    page = opened.page
+    expect(page.locator("#state")).to_have_text("FLY AGAIN", timeout=WAIT_MS)
+    expect(page.locator("#sentence")).to_have_text("Fly again: line 9")
+    expect(page.locator("#check-rows tr", has_text="Base data")).to_contain_text("? not known")
+    expect(page.locator("#check-rows tr", has_text="Base data")).to_contain_text(SCRIPT)  # as text
+    expect(page.locator("#check-rows tr", has_text="Overlap")).to_contain_text("● good")
+    expect(page.locator("#line-rows tr").nth(1)).to_contain_text("FLY AGAIN")
+    expect(page.locator("#gaps-note")).to_contain_text("3 smaller ones")
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    with page.expect_download(timeout=120_000) as download:
+        page.get_by_role("link", name="PDF").click()
+    assert download.value.suggested_filename == "landing.pdf"
+    assert Path(download.value.path()).read_bytes().startswith(b"%PDF-")
+    before = marks_of(logs)
+    page.get_by_role("button", name="Write into the log").click()
+    expect(page.locator("#answer")).to_contain_text("landing: Fly again: line 9", timeout=WAIT_MS)
+    wait_until(lambda: marks_of(logs) == [*before, "landing: Fly again: line 9"], "the verdict in the log")
+    page.locator("#gap-rows a").click()
+    expect(page.locator("#follow")).to_have_attribute("aria-pressed", "false", timeout=WAIT_MS)
+    expect(page.locator("#legend")).to_contain_text("gap", timeout=WAIT_MS)
+    assert opened.errors == []
+
+
+def test_the_operator_overrules_a_line_by_the_panel(
+    aircraft: tuple[Asked, Path], open_page: Callable[..., Opened]
+) -> None:
+    asked, logs = aircraft
+    page = open_page(asked.url, SIZES[2]).page
+    page.get_by_label("Line", exact=True).select_option("9", timeout=WAIT_MS)
+    page.get_by_label("is", exact=True).select_option("accepted")
+    page.get_by_label("because").fill(f"clouds {SCRIPT}")
+    before = marks_of(logs)
+    page.get_by_role("button", name="Overrule").click()
+    text = f"line 9: accepted, clouds {SCRIPT}"
+    expect(page.locator("#overruled")).to_contain_text(text, timeout=WAIT_MS)
+    expect(page.get_by_label("because")).to_have_value("")
+    wait_until(lambda: marks_of(logs) == [*before, text], "the overrule in the log")

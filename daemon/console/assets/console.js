@@ -1,8 +1,9 @@
 // The operator's page: header, panels and marks. The map has a module of its own.
-import { ask, begin, clock, listen, number, text } from "./feed.js";
+import { ask, begin, clock, listen, number, pressed, text } from "./feed.js";
 import { showGraphs } from "./graphs.js";
 import { prepareLook, showLook } from "./look.js";
 import { startMap } from "./map.js";
+import { prepareOverrule, showOverrule } from "./overrule.js";
 
 const SHAPES = { RECORDING: "●", DEGRADED: "▲", "NOT RECORDING": "■" };
 const RANK = { RECORDING: 0, DEGRADED: 1, "NOT RECORDING": 2 };
@@ -62,7 +63,9 @@ function showLines(found) {
     cell(row, line.name);
     cell(row, LINE_WORDS[line.state] ?? line.state, LINE_CLASS[line.state] ?? "");
     cell(row, line.flown_fraction === undefined || line.flown_fraction === null ? "" : `${number(100 * line.flown_fraction)} %`);
-    cell(row, (line.reasons ?? []).map((reason) => reason.text).join("; "));
+    const why = (line.reasons ?? []).map((reason) => reason.text);
+    if (line.overruled) why.unshift(`operator: ${line.overruled.verdict}${line.overruled.note ? `, ${line.overruled.note}` : ""}`);
+    cell(row, why.join("; "));
     return row;
   });
   $("lines-rows").replaceChildren(...rows);
@@ -145,20 +148,6 @@ async function prepareMarks() {
   });
 }
 
-function pressed(id, otherwise, change) {
-  const button = $(id);
-  const set = (on) => {
-    button.setAttribute("aria-pressed", String(on));
-    change(on);
-  };
-  set((localStorage.getItem(id) ?? otherwise) === "true");
-  button.addEventListener("click", () => {
-    const on = button.getAttribute("aria-pressed") !== "true";
-    localStorage.setItem(id, String(on));
-    set(on);
-  });
-}
-
 function choose(tab) {
   for (const one of document.querySelectorAll('[role="tab"]')) {
     const chosen = one === tab;
@@ -186,12 +175,14 @@ $("acknowledge").addEventListener("click", () => {
   }, { once: true });
 });
 prepareMarks();
+prepareOverrule();
 prepareLook();
 startMap();
 listen((found, role) => {
   for (const control of document.querySelectorAll("#marking button, #marking input")) control.disabled = role !== "operator";
   showHeader(found);
   showLines(found);
+  showOverrule(found.lines.lines ?? [], role);
   showSensors(found);
   showGraphs($("graphs"), found);
   showLook($("data"), found);

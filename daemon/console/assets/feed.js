@@ -58,3 +58,17 @@ export async function ask(path, what) {
 export const clock = (ms) => (ms === null ? "" : new Date(ms).toISOString().slice(11, 19));
 export const number = (value, digits = 0) =>
   value === null || value === undefined ? "–" : value.toLocaleString("en-US", { maximumFractionDigits: digits, minimumFractionDigits: digits }).replace("-", "−");
+
+export function pressed(id, otherwise, change) {
+  const button = document.getElementById(id);
+  const set = (on) => {
+    button.setAttribute("aria-pressed", String(on));
+    change(on);
+  };
+  set((localStorage.getItem(id) ?? otherwise) === "true");
+  button.addEventListener("click", () => {
+    const on = button.getAttribute("aria-pressed") !== "true";
+    localStorage.setItem(id, String(on));
+    set(on);
+  });
+}

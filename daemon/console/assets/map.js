@@ -1,6 +1,7 @@
 // The map: a level plane in metres, east and north of live's origin; the library draws it as a simple image map.
 /* global L */
 import { listen, number, text } from "./feed.js";
+import { seek } from "./seek.js";
 
 const TILE = 256;
 const LINE_COLOURS = { planned: "#5b6770", flying: "#0072b2", good: "#00598c", remarks: "#b36200", again: "#d7191c" };
@@ -227,6 +228,7 @@ export function startMap() {
       placed = true;
     }
     showBehind(found);
+    seek(map);
     drawPlan(found);
     showLegend(found.legend);
     const next = found.live.tiles?.sequence ?? -1;

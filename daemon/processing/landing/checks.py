@@ -13,13 +13,13 @@ import numpy as np
 
 from swath.calib.strips.standards import QUALITY_LEVELS
 from swath.daemon.config.tables import PlanWantedConfig
+from swath.daemon.processing.landing.command import AGAIN, FLY_AGAIN, GOOD, HOME, OPEN, REMARK, UNKNOWN, WAIT
 from swath.daemon.processing.landing.facts import LogFacts, Standing
 from swath.daemon.processing.landing.tracks import FlownPairs
+from swath.daemon.processing.pages.words import size_words
 from swath.georef.arrays import FloatArray
 from swath.georef.timescales.gps_time import SECOND_NS
 
-GOOD, REMARK, AGAIN, UNKNOWN, OPEN = "good", "remark", "again", "unknown", "open"
-HOME, FLY_AGAIN, WAIT = "home", "again", "wait"
 SHOWN_NAMES = 20
 SPARSE_REMARK, SPARSE_AGAIN = 0.05, 0.10  # of the blocks that may lie below the density, and below half of it
 USUAL_LEVEL = "QL2"  # of the height differences of strips, if ``quality_level`` names none
@@ -103,13 +103,6 @@ class Covered:
     gaps: tuple[FoundGap, ...] = ()
     more: int = 0
     densities: FloatArray = field(default_factory=lambda: np.zeros(0))
-
-
-def size_words(area_m2: float) -> str:
-    """Return an area in words."""
-    if area_m2 < 10_000.0:
-        return f"{area_m2:.0f} m²"
-    return f"{area_m2 / 1e4:.1f} ha" if area_m2 < 1e6 else f"{area_m2 / 1e6:.2f} km²"
 
 
 def _lines(names: Sequence[str], word: str = "line") -> str:

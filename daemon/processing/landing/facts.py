@@ -15,6 +15,7 @@ import numpy as np
 
 from swath.daemon.log.words import source_trouble
 from swath.daemon.processing.flightplan.moments import empty_moments
+from swath.daemon.processing.landing.command import MARK
 from swath.georef.arrays import Int64Array, StructArray
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.records import FixType, GnssFix
@@ -26,7 +27,6 @@ PAUSE_NS = 30 * SECOND_NS  # a pause of corrections from here on is one
 LOST_KEYS = ("lost_kernel", "lost_queue", "lost_write")
 MISSED_NS = 3 * SECOND_NS  # units that were recorded so much before the first one that was read: these were not read
 KEPT_TROUBLES = 20
-LANDING = "landing:"  # begins the text of the mark with which the operator writes the verdict into the log
 
 
 @dataclass(slots=True)
@@ -168,7 +168,7 @@ class LogFacts:
     def event(self, time_ns: int, event: Mapping[str, Any]) -> None:
         """Take an event of the recording."""
         code, text = event.get("code"), str(event.get("text", ""))
-        if code == "mark" and text.lower().startswith(LANDING):
+        if code == "mark" and text.lower().startswith(MARK):
             self.marked_ns = time_ns
         if code == "session_ended":
             self.has_ended = True

@@ -13,6 +13,7 @@ from swath.daemon.processing.live.tiles import SIDE, Place
 from swath.georef.arrays import BoolArray, ByteArray, FloatArray, Int64Array, StructArray
 
 BLOCK_M = 8.0  # side of the squares, or the next power of two of cells, over which density is judged
+MOST_THIN = 0.01  # of cells that may be empty between two that are not, for each that is not; then cells are joined
 MOST_CELLS = 8_000_000  # of a map whose gaps are looked for; cells of a larger one are joined
 REACH_M = 25.0  # without an area, gaps are what lies between points no farther apart
 MOST_OPEN = 0.1  # of a gap's edge without points, there; a corner between two swaths that cross has more
@@ -103,23 +104,56 @@ class Painted:
         return edges
 
     def ground(self, edges_m: FloatArray) -> Ground:
-        """Return the cells of whole tiles around edges (4,): west, south, east, north."""
+        """Return the cells of whole tiles around edges (4,): west, south, east, north.
+
+        They are the map's, or joined ones so wide that hardly any is empty for lack of pulses alone.
+        """
         side_m = SIDE * self._cell_m
         west, south = np.floor(edges_m[:2] / side_m).astype(int).tolist()
         east, north = np.maximum(np.ceil(edges_m[2:] / side_m).astype(int), (west + 1, south + 1)).tolist()
-        join, block = 1, self.block
-        while (east - west) * (north - south) * (SIDE // join) ** 2 > MOST_CELLS and join < block:
+        join, covered = 1, self._covered((west, south, east, north))
+        while join < SIDE and (covered.size > MOST_CELLS or _thin_share(covered) > MOST_THIN):
             join *= 2
-        side, blocks = SIDE // join, SIDE // block
-        covered = np.zeros(((north - south) * side, (east - west) * side), np.bool_)
-        pulses = np.zeros(((north - south) * blocks, (east - west) * blocks))
-        for (column, row), (bits, sums) in self._tiles.items():
-            if west <= column < east and south <= row < north:
-                up, across = row - south, column - west
-                cells = np.unpackbits(bits, axis=1).astype(np.bool_).reshape(side, join, side, join).any(axis=(1, 3))
-                covered[up * side : (up + 1) * side, across * side : (across + 1) * side] = cells
-                pulses[up * blocks : (up + 1) * blocks, across * blocks : (across + 1) * blocks] = sums
+            covered = _joined(covered)
+        block = max(join, self.block)
+        pulses = self._pulses((west, south, east, north), block)
         return Ground(west * side_m, south * side_m, join * self._cell_m, covered, block // join, pulses)
+
+    def _covered(self, edges: tuple[int, int, int, int]) -> BoolArray:
+        """Return the map's own cells between edges, in tiles; True: has a point."""
+        west, south, east, north = edges
+        covered = np.zeros(((north - south) * SIDE, (east - west) * SIDE), np.bool_)
+        for (column, row), (bits, _) in self._tiles.items():
+            if west <= column < east and south <= row < north:
+                up, across = (row - south) * SIDE, (column - west) * SIDE
+                covered[up : up + SIDE, across : across + SIDE] = np.unpackbits(bits, axis=1)
+        return covered
+
+    def _pulses(self, edges: tuple[int, int, int, int], block: int) -> FloatArray:
+        """Return first returns of blocks between edges, in tiles."""
+        west, south, east, north = edges
+        side, within = SIDE // block, block // self.block
+        pulses = np.zeros(((north - south) * side, (east - west) * side))
+        for (column, row), (_, sums) in self._tiles.items():
+            if west <= column < east and south <= row < north:
+                up, across = (row - south) * side, (column - west) * side
+                joined = sums.reshape(side, within, side, within).sum(axis=(1, 3))
+                pulses[up : up + side, across : across + side] = joined
+        return pulses
+
+
+def _joined(covered: BoolArray) -> BoolArray:
+    """Return cells joined four to one."""
+    rows, columns = covered.shape
+    found: BoolArray = np.logical_or.reduce(covered.reshape(rows // 2, 2, columns // 2, 2), axis=(1, 3))
+    return found
+
+
+def _thin_share(covered: BoolArray) -> float:
+    """Return the number of empty cells just between two covered ones, in a row or column, over that of the covered."""
+    empty = ~covered[1:-1, 1:-1]
+    row, column = covered[1:-1, :-2] & covered[1:-1, 2:], covered[:-2, 1:-1] & covered[2:, 1:-1]
+    return float((empty & (row | column)).sum()) / max(1.0, float(covered.sum()))
 
 
 def inside(ground: Ground, polygons: Sequence[Sequence[FloatArray]]) -> BoolArray:

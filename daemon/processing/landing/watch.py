@@ -31,6 +31,7 @@ from swath.daemon.processing.landing.checks import (
     sentence,
     static_check,
 )
+from swath.daemon.processing.landing.command import VERDICT, VERSION
 from swath.daemon.processing.landing.facts import LogFacts
 from swath.daemon.processing.landing.gaps import Gap, Painted, between, densities, gaps_of, inside
 from swath.daemon.processing.landing.tracks import pairs_of, tracks_of
@@ -38,8 +39,6 @@ from swath.daemon.processing.live.tiles import replace_file
 from swath.georef.arrays import BoolArray, FloatArray
 from swath.georef.timescales.gps_time import SECOND_NS
 
-VERDICT = "verdict.json"
-VERSION = 1
 EVERY_NS = 30 * SECOND_NS  # of log time; a mark and the end of the log do not wait for it
 MOST_GAPS = 100  # whose place is looked at
 UNDER_SHARE = 0.9  # of a gap that one or several swaths have covered
@@ -174,6 +173,7 @@ class Landing:
         config: table ``[plan]``.
         corrections: names of ``[corrections.*]``.
         calibration: entry of the verdict on the calibrations in use.
+        head: for the page's head: ``aircraft``, ``author``, ``crs``, ``calibrations``.
 
     Attributes:
         facts: of the log.
@@ -186,10 +186,12 @@ class Landing:
         config: PlanConfig,
         corrections: Sequence[str],
         calibration: Mapping[str, Any],
+        head: Mapping[str, Any] | None = None,
     ) -> None:
         self.facts = LogFacts(info.realtime_ns)
         self._info, self._path, self._config = info, folder / VERDICT, config
         self._corrections, self._calibration = list(corrections), calibration
+        self._head = dict(head or {})
         self._painted = Painted()
         self._saved_ns = -(1 << 62)
         self._marked_ns: int | None = None
@@ -252,6 +254,7 @@ class Landing:
             "version": VERSION,
             "session_id": self._info.session_id,
             "plan": lines["plan"],
+            "head": self._head,
             "log_time_ns": facts.newest_ns,
             "flown_gps_ns": [int(track["gps_ns"][0]), int(track["gps_ns"][-1])] if len(track) else None,
             "has_ended": facts.has_ended,

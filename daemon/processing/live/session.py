@@ -22,13 +22,16 @@ from swath.daemon.log.reader import Session
 from swath.daemon.log.session import read_boot_id
 from swath.daemon.processing.carried_verdict import calibration_verdicts, verdict_entry
 from swath.daemon.processing.landing.checks import Covered
-from swath.daemon.processing.landing.watch import VERDICT, Landing, Places
+from swath.daemon.processing.landing.command import PAGE, PRINTED, VERDICT, PagePrinter
+from swath.daemon.processing.landing.page import landing_page, read_verdict
+from swath.daemon.processing.landing.watch import Landing, Places
 from swath.daemon.processing.live.follow import LiveFollower, LivePart, Skipped
 from swath.daemon.processing.live.lines import LINES, LiveLines
 from swath.daemon.processing.live.points import PointsFile
 from swath.daemon.processing.live.products import LiveProducts, Room
 from swath.daemon.processing.live.status import LiveStatus, sentence, write_status
-from swath.daemon.processing.live.tiles import Placement
+from swath.daemon.processing.live.tiles import Placement, replace_file
+from swath.daemon.processing.pages.head import calibrations_words, crs_words
 from swath.daemon.processing.points.feed import LogFeed, Placed
 from swath.daemon.processing.setup.sent_files import SentFiles
 from swath.daemon.processing.setup.setup import Options, Setup, config_in_log
@@ -38,6 +41,7 @@ from swath.georef.trajectory.trajectory import Trajectory
 FOLDER = "live"  # in the log directory
 POLL_S = 0.05
 STATUS_S = 1.0
+PRINT_WAIT_S = 8.0  # for the page at the end; the service has to end in time
 COVERAGE_S = 10.0
 COVERAGE_SHARE = 100.0  # times as long as it takes; on large areas the coverage is saved less often
 SENT_WAIT_NS = 10_000_000_000  # how long a recording may go on until its scanners have sent their angles
@@ -73,6 +77,8 @@ class LiveSession:
         verdict: verdict on the calibrations, for the status.
         lines: the state of the lines.
         landing: the verdict before landing.
+        folder: of its files.
+        printer: writes the verdict's page.
         log_state: what is known of the log: ``part``, ``damaged_chunks``, ``live_skipped_s``.
     """
 
@@ -102,7 +108,13 @@ class LiveSession:
         self._path = _SeenPath(self._stream.path)
         self._stream.path = self._path
         tables = setup.config.tables
-        self.landing = Landing(info, folder, tables.plan, list(tables.corrections), self.verdict)
+        head = {
+            "aircraft": tables.profile.aircraft,
+            "author": tables.profile.operator,
+            "crs": "" if setup.mapping is None else crs_words(setup.mapping.description()),
+            "calibrations": calibrations_words(setup.calibrations),
+        }
+        self.landing = Landing(info, folder, tables.plan, list(tables.corrections), self.verdict, head)
         self.lines = LiveLines(setup, self._stream, folder, self.landing.facts)
         self._feed = LogFeed(setup, self._stream, self.lines)
         self.lines.parser = self._feed.parser
@@ -118,6 +130,8 @@ class LiveSession:
         self.products = LiveProducts(folder, live, setup.mapping, reserve_bytes, about, self._gps_from_host)
         self.status = LiveStatus(setup, self._stream, self.products, self._feed.fixes)
         self.log_state: Told = {}
+        self.folder, self.printer = folder, PagePrinter(folder)
+        (folder / PRINTED).unlink(missing_ok=True)  # of a recording before
         self.points: PointsFile | None = None
         if points is not None:
             room = Room(points.parent, 2 * reserve_bytes) if beside_recorder else None
@@ -139,13 +153,14 @@ class LiveSession:
         self.products.save_map({"session_id": self.info.session_id}, self.now_ns)
         self._save_lines()
         if self.landing.is_due(self.now_ns):
-            self._save_verdict()
+            self._save_verdict(live=live)
 
-    def _save_verdict(self) -> None:
+    def _save_verdict(self, *, live: bool) -> None:
         """Write the verdict before landing, unless free space is low."""
-        found = self._covered()
         if not self.products.room.is_enough:
             return
+        found = self._covered()
+        is_asked = self.landing.is_asked
         lines, comparison = self.lines, self.products.map.comparison
         verdict = self.landing.verdict(
             lines.watch, lines.plan, lines.trouble, found, comparison.total.numbers(), self.log_state
@@ -154,6 +169,20 @@ class LiveSession:
             self.landing.save(verdict, self.now_ns)
         except OSError as error:
             self.products.trouble = f"{VERDICT}: {error.strerror or error}: the verdict is not written"
+            return
+        if is_asked and live:
+            self.printer.ask()
+
+    def print_verdict(self, *, live: bool) -> None:
+        """Write the page of the last verdict, and its PDF if the operator has asked for it during the flight."""
+        if not self.products.room.is_enough:
+            return
+        if live and self.printer.has_printed:
+            self.printer.ask()
+            self.printer.finish(PRINT_WAIT_S)
+            return
+        with contextlib.suppress(UserError):  # there is none, as products.trouble says
+            replace_file(self.folder / PAGE, landing_page(self.folder, read_verdict(self.folder)).encode())
 
     def _covered(self) -> Covered | None:
         """Return how the area is covered; None: nothing is known of it."""
@@ -206,7 +235,8 @@ class LiveSession:
         self.products.map.end()
         self.products.save_map({"session_id": self.info.session_id}, self.now_ns, last=True)
         self._save_lines(last=True)
-        self._save_verdict()
+        self._save_verdict(live=live)
+        self.print_verdict(live=live)
         self.products.close()
         if self.points is not None:
             self.points.close()
@@ -214,6 +244,7 @@ class LiveSession:
     def look_for_room(self) -> None:
         """Check for free space; call once a second."""
         self.products.look_for_room()
+        self.printer.look()
         if self.points is not None:
             self.points.look_for_room()
 

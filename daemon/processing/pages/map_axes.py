@@ -16,18 +16,12 @@ from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 from matplotlib.transforms import Bbox
 
-from swath.daemon.processing.pages.words import INK, MUTED, thousands
+from swath.daemon.processing.pages.words import INK, MUTED, round_down, thousands
 
 HALO = [withStroke(linewidth=2.4, foreground="white")]
 BAR_IN = 0.05  # height of a scale bar
 LABEL_IN = 0.85  # room for a coordinate of seven digits
 GAP_PX = 2.0  # minimum distance of two names
-
-
-def round_down(size: float) -> float:
-    """Return the largest of 1, 2, 5 × 10ⁿ that is not above a size."""
-    power = 10.0 ** math.floor(math.log10(size))
-    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= size * (1 + 1e-9))
 
 
 def coordinates(axes: Axes, unit: str = "m", ticks: tuple[int, int] = (5, 5)) -> None:

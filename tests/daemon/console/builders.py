@@ -182,3 +182,47 @@ def write_mbtiles(
             data = as_file(pixels, "PNG") if kind == "png" else b"\x1f\x8b\x08 of vectors"
             base.execute("INSERT INTO tiles VALUES (?, ?, ?, ?)", (WEB_ZOOM, column, (1 << WEB_ZOOM) - 1 - row, data))
     base.close()
+
+
+def verdict(*, name: str = "9", note: str = "") -> dict[str, Any]:
+    """Return a verdict before landing as live writes it: one line good, one to be flown again, a gap beside it."""
+    gap = {
+        "number": 1,
+        "east_m": 30.0,
+        "north_m": 12.0,
+        "lat_deg": 47.5,
+        "lon_deg": 8.9,
+        "area_m2": 420.0,
+        "width_m": 9.0,
+        "length_m": 50.0,
+        "line": name,
+        "under": [],
+        "grave": True,
+        "text": f"420 m², 9 m wide, nearest to line {name}",
+    }
+    checks = [
+        ("lines", "Lines", "again", f"1 good, line {name} to be flown again", [f"line {name}: {note}"]),
+        ("gaps", "Gaps", "again", "1 of 100 m² and more", [gap["text"]]),
+        ("overlap", "Overlap", "good", "as wanted", []),
+        ("base", "Base data", "unknown", "no [corrections] are configured", [f"gnss/rover: {note}"]),
+        ("static", "Standing still", "open", "after landing stand still for 60 s", []),
+    ]
+    accepted = {"verdict": "accepted", "note": note, "time_ns": 5}
+    return {
+        "version": 1,
+        "session_id": "flight-1",
+        "plan": "plan.kml",
+        "head": {"aircraft": "HB-XYZ", "author": "", "crs": "", "calibrations": ["left, nominal"]},
+        "log_time_ns": 1_781_514_000_000_000_000,
+        "flown_gps_ns": [1_465_549_218_000_000_000, 1_465_549_712_000_000_000],
+        "has_ended": False,
+        "state": "again",
+        "sentence": f"Fly again: line {name}",
+        "checks": [dict(zip(("code", "title", "state", "text", "details"), one, strict=True)) for one in checks],
+        "area": {"planned": True, "wanted_m2": 5e5, "covered_m2": 4.9e5, "cell_m": 2.0, "gaps": [gap], "more_gaps": 3,
+                 "density_per_m2": {"p05": 4.0, "p50": 6.0}},
+        "lines": [
+            {"name": "4", "state": "remarks", "flown_fraction": 1.0, "why": ["speed"], "overruled": accepted},
+            {"name": name, "state": "again", "flown_fraction": 0.5, "why": ["GNSS lost"], "overruled": None},
+        ],
+    }  # fmt: skip

@@ -86,7 +86,8 @@ def test_a_new_part_begins_when_asked(aircraft: Aircraft) -> None:
 
 
 def test_every_page_has_the_headers_that_keep_others_code_out(aircraft: Aircraft) -> None:
-    for path in ("/", "/pilot", "/login", "/assets/console.js", "/assets/leaflet/leaflet.js", "/about", "/nothing"):
+    pages = ("/", "/pilot", "/landing", "/login")
+    for path in (*pages, "/assets/console.js", "/assets/leaflet/leaflet.js", "/about", "/nothing"):
         found = aircraft.asked.get(path)
         assert {name: found.headers.get(name) for name in HEADERS} == HEADERS, path
         if b"<html" in found.body:

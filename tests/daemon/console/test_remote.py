@@ -43,10 +43,11 @@ def session_of(asked: Asked, role: str) -> str:
 
 
 def test_a_token_opens_what_its_role_may_do(remote: Asked) -> None:
-    for path in ("/feed", "/about", "/history", "/tiles/height/0/0/0.png", "/"):
+    ours = ("/landing", "/verdict", "/landing.pdf", "/coverage.kmz")
+    for path in ("/feed", "/about", "/history", "/tiles/height/0/0/0.png", "/", *ours):
         assert remote.get(path).status == 401, path
         assert remote.get(path, Cookie="swath_console=guessed").status == 401, path
-    for path in ("/mark", "/split", "/session/end"):
+    for path in ("/mark", "/split", "/session/end", "/landing", "/overrule"):
         assert remote.post(path, {"text": "of a stranger"}).status == 401, path
     page = remote.get("/", Accept="text/html")
     assert (page.status, page.headers["location"]) == (303, "/login")
@@ -55,6 +56,9 @@ def test_a_token_opens_what_its_role_may_do(remote: Asked) -> None:
     viewer, operator = session_of(remote, VIEWER), session_of(remote, OPERATOR)
     assert next(remote.feed(Cookie=viewer))["header"]["state"] == "NOT RECORDING"
     assert remote.post("/mark", {"text": "by a viewer"}, Cookie=viewer).status == 403
+    assert remote.get("/verdict", Cookie=viewer).status == 200
+    for path in ("/landing", "/overrule"):
+        assert remote.post(path, {"line": "4", "verdict": "again"}, Cookie=viewer).status == 403
     refused = remote.post("/mark", {"text": "by the operator"}, Cookie=operator)
     assert (refused.status, "no recorder is running" in refused.plain()["error"]) == (409, True)
     assert remote.post("/session/end", {}, Cookie=operator).status == 200
