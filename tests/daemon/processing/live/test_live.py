@@ -343,6 +343,7 @@ class TestStatus:
             waiting=lambda name: 0,
         )
         products: Any = Mock(points=Counter(), origin=lambda: {})
+        products.map.comparison.present.return_value = {}
         status = LiveStatus(Mock(), stream, products)
         said = []
         for georeferenced, no_time, past_hour in ((0, 500, 0), (1000, 500, 0), (1900, 600, 0), (1900, 900, 300)):
@@ -361,7 +362,8 @@ class TestStatus:
             scanners=[], clocks=SimpleNamespace(host=host), path=SimpleNamespace(covered_until_ns=7)
         )
         products: Any = Mock(points=Counter(), origin=lambda: {})
-        setup: Any = SimpleNamespace(sources=SimpleNamespace(ins_source="gnss/rover"))
+        products.map.comparison.present.return_value = {}
+        setup: Any = Mock(sources=SimpleNamespace(ins_source="gnss/rover"))
         status = LiveStatus(setup, stream, products)
         assert status.plain(None, 0)["trajectory"] == {"source": "gnss/rover", "covered_until_gps_ns": 7}
         status.navigation = "aligned with dual-antenna heading"
