@@ -108,6 +108,7 @@ class GivenMotion:
 
 
 Predict = Callable[[StructArray, Int64Array, "Trajectory"], FloatArray]
+Unanswered = Callable[[StructArray, Int64Array, "Trajectory"], None]
 LeftOut = Callable[[StructArray, Int64Array, ByteArray, "Trajectory | None"], None]
 
 
@@ -126,6 +127,8 @@ class ScannerChain:
         given: passes that motion to the georeferencer; goes with ``motion``.
         left_out: takes the returns without a point: rows, GPS times (-1: unknown), fates, and the trajectory if one was
             used. Returns that the resolver drops are only counted.
+        unanswered: takes pulses without a return whose range would not have been apparent: rows, GPS times, trajectory.
+            Points and the encoder's motion are what they are without these.
     """
 
     name: str
@@ -136,6 +139,7 @@ class ScannerChain:
     motion: Motion | None = None
     given: GivenMotion | None = None
     left_out: LeftOut | None = None
+    unanswered: Unanswered | None = None
 
 
 class _Lane:
@@ -252,6 +256,9 @@ class _Lane:
         self._resolves = self._resolves or any_has(rows, "mta_zone", ZONE_UNKNOWN)
         if not self._resolves:
             return rows, time_ns
+        answered = (rows["number_of_returns"] > 0) | (rows["mta_zone"] == ZONE_UNKNOWN)
+        if not answered.all():  # no emission of an echo that is looked for
+            rows, time_ns = take(rows, answered), time_ns[answered]
         held = resolver.waiting
         predict = self.chain.predict
         given = (
@@ -268,6 +275,11 @@ class _Lane:
 
     def _points(self, rows: StructArray, time_ns: Int64Array, trajectory: Trajectory, *, last: bool) -> Points | None:
         chain = self.chain
+        if chain.unanswered is not None and any_has(rows, "flags", CONTEXT_FLAG):
+            alone = rows["number_of_returns"] == 0
+            if alone.any():
+                chain.unanswered(take(rows, alone), time_ns[alone], trajectory)
+                rows, time_ns = take(rows, ~alone), time_ns[~alone]
         if chain.motion is not None and chain.given is not None:
             rows, time_ns, chain.given.rate, chain.given.acceleration = self._moving(
                 chain.motion, rows, time_ns, last=last

@@ -33,7 +33,7 @@ CELL_DTYPE = np.dtype(
         ("highest", "i2"),
         ("strip", "u2"),  # the newest
         ("difference", "i2"),  # of two strips, in millimetres
-        ("no_return", "u2"),  # pulses without a return; 0 so far
+        ("no_return", "u2"),  # pulses without a return
         ("strips", "u1"),
         ("compared", "u1"),  # 1: two strips have been compared
     ],
@@ -112,6 +112,25 @@ class CellGrid:
                 scale = np.append(unit_m[:2] / self.cell_m, unit_m[2])
         self.refused = int(self._state[1])
         self.points += len(points)
+
+    def add_no_return(self, places: FloatArray) -> None:
+        """Add pulses without a return at places (n, 3) in the frame ``local``; not in tiles that would not fit."""
+        cells = np.floor(places[:, :2] / self.cell_m).astype(np.int64)
+        near = np.flatnonzero((np.abs(cells) < _FAR).all(axis=1))
+        tiles, of_tile = np.unique(cells[near] >> _BITS, axis=0, return_inverse=True)
+        for number, (column, row) in enumerate(tiles.tolist()):
+            own = near[of_tile.reshape(-1) == number]
+            held = self.held
+            slot = _take_tile(column, row, self._keys, self._slots, self._places, self._state)
+            if slot < 0:
+                continue
+            if self.held > held:
+                self._bases[slot] = np.round(places[own[0], 2])
+            across, up = (cells[own] & (SIDE - 1)).T
+            counts = np.bincount(up * SIDE + across, minlength=SIDE * SIDE).reshape(SIDE, SIDE)
+            part = self._cells[slot]["no_return"]
+            part[:] = np.minimum(part + counts, _LAST_SECOND)
+            self._changed[slot] = 1
 
     @property
     def held(self) -> int:

@@ -23,6 +23,7 @@ from swath.daemon.processing.live.frame import LocalFrame, Maps
 from swath.daemon.processing.live.look import PROFILE, LastLook
 from swath.daemon.processing.live.mcap import NAME, LiveMcap, LivePose
 from swath.daemon.processing.live.painting import COVERAGE, LiveMap
+from swath.daemon.processing.live.unanswered import UnansweredPulses
 from swath.georef.arrays import Int64Array
 from swath.georef.compiled import jit_cached
 from swath.georef.geodesy.earth import geodetic_from_e
@@ -103,6 +104,7 @@ class LiveProducts:
         points: number of points by scanner; ``shown``: written to live.mcap; ``unwritten``: thinned but not written.
         map: the map of cells, with its tiles.
         look: the last moments.
+        unanswered: by scanner, its pulses without a return, where its parser tells them.
         trouble: why no files are written, for people; empty: they are.
     """
 
@@ -136,6 +138,7 @@ class LiveProducts:
         self.frame: LocalFrame | None = None
         self.map = LiveMap(folder, live.cell_m, int(TILES_SHARE * live.live_quota_mb * 1e6), gps_from_host)
         self.look = LastLook()
+        self.unanswered: dict[str, UnansweredPulses] = {}
         self._trajectory: Trajectory | None = None
         self._placement: dict[str, Any] | None = None
         self._folder, self._live, self._mapping, self._about = folder, live, mapping, about
@@ -160,6 +163,8 @@ class LiveProducts:
         if trajectory is not None:
             self.map.update(trajectory, log_time_ns)
         self.map.take(points, self.frame)
+        if name in self.unanswered:
+            self.map.grid.add_no_return(self.unanswered[name].places(points, self.frame))
         keep = self._thinning.keep(points.time_ns)
         count = len(keep)
         if count:
@@ -184,6 +189,8 @@ class LiveProducts:
         lat, lon, height = geodetic_from_e(position_e)
         self._trajectory = trajectory
         self.look.take_pose(int(trajectory.time_ns[-1]), position)
+        for pulses in self.unanswered.values():
+            self.map.grid.add_no_return(pulses.overdue(int(trajectory.time_ns[-1]), self.frame))
         pose = LivePose(
             unix_from_gps(int(trajectory.time_ns[-1])),
             math.degrees(lat),

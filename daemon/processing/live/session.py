@@ -31,11 +31,14 @@ from swath.daemon.processing.live.points import PointsFile
 from swath.daemon.processing.live.products import LiveProducts, Room
 from swath.daemon.processing.live.status import LiveStatus, sentence, write_status
 from swath.daemon.processing.live.tiles import Placement, replace_file
+from swath.daemon.processing.live.unanswered import UnansweredPulses
 from swath.daemon.processing.pages.head import calibrations_words, crs_words
 from swath.daemon.processing.points.feed import LogFeed, Placed
 from swath.daemon.processing.setup.sent_files import SentFiles
 from swath.daemon.processing.setup.setup import Options, Setup, config_in_log
+from swath.drivers.scanner.srep.parser import SrepParser
 from swath.georef.arrays import StructArray
+from swath.georef.georeference import Georeferencer
 from swath.georef.trajectory.trajectory import Trajectory
 
 FOLDER = "live"  # in the log directory
@@ -132,11 +135,20 @@ class LiveSession:
         self.log_state: Told = {}
         self.folder, self.printer = folder, PagePrinter(folder)
         (folder / PRINTED).unlink(missing_ok=True)  # of a recording before
+        self._ask_for_unanswered()
         self.points: PointsFile | None = None
         if points is not None:
             room = Room(points.parent, 2 * reserve_bytes) if beside_recorder else None
             self.points = PointsFile(points, self._stream.scanners, room)
         self._is_own = info.boot_id == read_boot_id()
+
+    def _ask_for_unanswered(self) -> None:
+        """Let the parsers that can tell pulses without a return do so, for the map."""
+        for name in self._stream.scanners:
+            chain, parser = self._stream.chain(name), self._feed.parser(f"scanner/{name}")
+            if isinstance(parser, SrepParser) and isinstance(chain.georeferencer, Georeferencer):
+                self.products.unanswered[name] = UnansweredPulses(chain.georeferencer)
+                parser.unanswered, chain.unanswered = True, self.products.unanswered[name].take_pulses
 
     def take(self, batch: LogBatch, *, live: bool) -> None:
         """Take the next messages."""

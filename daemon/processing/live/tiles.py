@@ -203,7 +203,7 @@ class View:
         west_m, south_m: edges in the frame ``local``.
         cell_m: side of a cell of this view.
         layers: by name of `LAYERS`, values (rows, columns). ``points``, ``pulses`` (first returns) and ``no_return``
-            (0 so far: no parser gives such pulses a place) are numbers of a cell; heights are in metres above the
+            (of scanners whose parser tells such pulses) are numbers of a cell; heights are in metres above the
             origin; ``gps_s`` is the whole GPS second of the newest point, 0: none; ``strip`` is the newest strip, 0:
             none; ``strips`` the number of strips that have points there; ``difference_m`` is the height of an earlier
             strip minus that of a later one.

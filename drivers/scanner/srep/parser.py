@@ -114,6 +114,7 @@ class SrepParser(PacketParser):
         emissions: if True, where ranges are apparent (byte 15 = 255), a pulse without a return makes a row too, of
             range 0 and no returns, flagged `FLAG_NO_POINT`: matching echoes to emissions needs time and encoder of all
             pulses.
+        unanswered: if True, such rows are made where ranges are true as well: for a map of where no pulse came back.
         tell_rates: called with ``pulse_id``, pulse rate in Hz (0: unknown) and tick_hz of the first datagram, and of
             each datagram with other rates, before its returns are handed over.
     """
@@ -128,7 +129,7 @@ class SrepParser(PacketParser):
         self._newest = -LATE_DATAGRAMS - 1
         self._last_status: tuple[int, ...] | None = None
         self._last_rates = (-1, 0)
-        self.emissions = False
+        self.emissions = self.unanswered = False
         self.tell_rates: Callable[[int, float, int], None] | None = None
 
     def parse_units(self, host_time_ns: Int64Array, units: ByteRows) -> list[Record]:
@@ -259,18 +260,23 @@ class SrepParser(PacketParser):
             part = slice(start, stop)
             body = words[ends[start - 1] if start else 0 : ends[stop - 1]]
             block = self._block(host_time_ns[part], header[part], body, unwrapped[part])
-            apparent = header["mta_zone"][part] == ZONE_UNKNOWN
-            if self.emissions and apparent.any():
-                filled += self._fill_all(block, np.repeat(apparent, header["pulses"][part]), table[filled:])
+            wanted = self.emissions & (header["mta_zone"][part] == ZONE_UNKNOWN) | self.unanswered
+            if wanted.any():
+                filled += self._fill_all(block, np.repeat(wanted, header["pulses"][part]), table[filled:])
             else:
                 filled += self._fill(block, table[filled:])
         return table[:filled]
 
-    def _fill_all(self, block: ReturnSlots, apparent: BoolArray, table: StructArray) -> int:
-        """Fill rows in order of pulses, also a row for each pulse without a return where ranges are ``apparent``."""
+    def _fill_all(self, block: ReturnSlots, wanted: BoolArray, table: StructArray) -> int:
+        """Fill rows in order of pulses, also a row for each pulse without a return that is ``wanted`` (pulses,)."""
+        ranges = block.content["range"][:, block.others :]
+        returns = np.zeros(len(ranges), np.int64)
+        for slot in range(ranges.shape[1]):
+            returns += ranges[:, slot] != 0
+        alone = (returns == 0) & wanted
+        if not alone.any():
+            return self._fill(block, table)
         content = block.content.copy()
-        returns = np.count_nonzero(content["range"][:, block.others :], axis=1)
-        alone = (returns == 0) & apparent
         content["range"][alone, block.others] = 1  # makes `fill` write a row
         block.content = content
         filled = self._fill(block, table)

@@ -85,6 +85,21 @@ def test_every_pulse_gives_a_row_if_ranges_are_apparent(slots: int, at_once: int
     assert empty["host_time_ns"].tolist() == datagram[alone].tolist()
 
 
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("slots", [1, 3])
+def test_every_pulse_gives_a_row_if_those_without_return_are_asked_for(slots: int, compiled: bool) -> None:
+    units = datagrams(slots, [255, 0, 1, 2, 0, 0])
+    plain = rows_of(parser(emissions=False), units, 4)
+    reader = parser(emissions=False, compiled=compiled)
+    reader.unanswered = True
+    rows = rows_of(reader, units, 4)
+    alone = rows["number_of_returns"] == 0
+    np.testing.assert_array_equal(rows[~alone], plain)
+    assert (rows["flags"][alone] == FLAG_NO_POINT | 4).all()
+    places = [number << 16 | pulse for number in range(6) for pulse in range(PULSES)]
+    assert np.unique(rows["pulse_id"].astype(np.int64)).tolist() == places
+
+
 def test_pulses_without_return_are_omitted_unless_requested() -> None:
     units = datagrams(2, [255] * 5)
     assert rows_of(parser(emissions=False), units, 5)["number_of_returns"].all()
