@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -17,6 +16,7 @@ MOST_THIN = 0.01  # of cells that may be empty between two that are not, for eac
 MOST_CELLS = 8_000_000  # of a map whose gaps are looked for; cells of a larger one are joined
 REACH_M = 25.0  # without an area, gaps are what lies between points no farther apart
 MOST_OPEN = 0.1  # of a gap's edge without points, there; a corner between two swaths that cross has more
+MOST_DEPTHS = 250_000
 SAMPLE = 60  # cells of a gap whose place is looked at
 BESIDE = ndimage.generate_binary_structure(2, 2)  # cells that touch at a corner belong together
 
@@ -52,7 +52,7 @@ class Gap:
 
     Attributes:
         area_m2: size.
-        width_m: of the largest circle in it, to a cell.
+        width_m: of the largest circle in it, to a cell; of a gap of more than a quarter million cells, to 1/250 of it.
         length_m: of the rectangle's diagonal around it.
         place_m: (2,) east and north of that circle's centre.
         sample_m: (n, 2) east and north of some of its cells, spread over it.
@@ -111,22 +111,29 @@ class Painted:
         side_m = SIDE * self._cell_m
         west, south = np.floor(edges_m[:2] / side_m).astype(int).tolist()
         east, north = np.maximum(np.ceil(edges_m[2:] / side_m).astype(int), (west + 1, south + 1)).tolist()
-        join, covered = 1, self._covered((west, south, east, north))
-        while join < SIDE and (covered.size > MOST_CELLS or _thin_share(covered) > MOST_THIN):
+        join = 1
+        while join < SIDE and (east - west) * (north - south) * (SIDE // join) ** 2 > MOST_CELLS:
+            join *= 2
+        covered = self._covered((west, south, east, north), join)
+        while join < SIDE and _thin_share(covered) > MOST_THIN:
             join *= 2
             covered = _joined(covered)
         block = max(join, self.block)
         pulses = self._pulses((west, south, east, north), block)
         return Ground(west * side_m, south * side_m, join * self._cell_m, covered, block // join, pulses)
 
-    def _covered(self, edges: tuple[int, int, int, int]) -> BoolArray:
-        """Return the map's own cells between edges, in tiles; True: has a point."""
+    def _covered(self, edges: tuple[int, int, int, int], join: int) -> BoolArray:
+        """Return cells between edges, in tiles, ``join`` of the map's along a side; True: has a point."""
         west, south, east, north = edges
-        covered = np.zeros(((north - south) * SIDE, (east - west) * SIDE), np.bool_)
+        side = SIDE // join
+        covered = np.zeros(((north - south) * side, (east - west) * side), np.bool_)
         for (column, row), (bits, _) in self._tiles.items():
             if west <= column < east and south <= row < north:
-                up, across = (row - south) * SIDE, (column - west) * SIDE
-                covered[up : up + SIDE, across : across + SIDE] = np.unpackbits(bits, axis=1)
+                cells: BoolArray = np.unpackbits(bits, axis=1).view(np.bool_)
+                for _ in range(join.bit_length() - 1):  # a power of two
+                    cells = _joined(cells)
+                up, across = (row - south) * side, (column - west) * side
+                covered[up : up + side, across : across + side] = cells
         return covered
 
     def _pulses(self, edges: tuple[int, int, int, int], block: int) -> FloatArray:
@@ -144,8 +151,8 @@ class Painted:
 
 def _joined(covered: BoolArray) -> BoolArray:
     """Return cells joined four to one."""
-    rows, columns = covered.shape
-    found: BoolArray = np.logical_or.reduce(covered.reshape(rows // 2, 2, columns // 2, 2), axis=(1, 3))
+    pairs = covered[0::2] | covered[1::2]
+    found: BoolArray = pairs[:, 0::2] | pairs[:, 1::2]
     return found
 
 
@@ -170,7 +177,7 @@ def inside(ground: Ground, polygons: Sequence[Sequence[FloatArray]]) -> BoolArra
 def _even_odd(ground: Ground, rings: Sequence[FloatArray]) -> BoolArray:
     """Return the cells that an odd number of edges lies west of."""
     rows, columns = ground.covered.shape
-    toggles = np.zeros((rows, columns + 1), np.int32)
+    toggles = np.zeros((rows, columns + 1), np.uint8)
     for ring in rings:
         cells = (ring - (ground.west_m, ground.south_m)) / ground.cell_m - 0.5  # centres have whole numbers
         for (x0, y0), (x1, y1) in zip(cells.tolist(), np.roll(cells, -1, axis=0).tolist(), strict=True):
@@ -178,8 +185,8 @@ def _even_odd(ground: Ground, rings: Sequence[FloatArray]) -> BoolArray:
             across = np.arange(max(0, int(np.ceil(low))), min(rows, int(np.ceil(high))))
             if len(across):
                 x = x0 + (across - y0) * (x1 - x0) / (y1 - y0)
-                np.add.at(toggles, (across, np.clip(np.ceil(x), 0, columns).astype(np.int64)), 1)
-    odd: BoolArray = np.cumsum(toggles[:, :-1], axis=1) % 2 == 1
+                np.bitwise_xor.at(toggles, (across, np.clip(np.ceil(x), 0, columns).astype(np.int64)), 1)
+    odd: BoolArray = np.bitwise_xor.accumulate(toggles[:, :-1], axis=1).view(np.bool_)
     return odd
 
 
@@ -218,26 +225,24 @@ def gaps_of(ground: Ground, wanted: BoolArray, least_m2: float) -> list[Gap]:
 
 
 def _gap(ground: Ground, mask: BoolArray, box: tuple[slice, slice], area_m2: float) -> Gap:
-    depth = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
-    deepest = np.unravel_index(int(np.argmax(depth)), depth.shape)
+    every = max(1, int(np.sqrt(mask.size / MOST_DEPTHS)))  # a large gap is measured in coarser steps
+    depth = every * ndimage.distance_transform_edt(np.pad(mask[::every, ::every], 1))[1:-1, 1:-1]
+    deepest = every * np.array(np.unravel_index(int(np.argmax(depth)), depth.shape))
     rows, columns = np.nonzero(mask)
     step = max(1, len(rows) // SAMPLE)
     origin = np.array([box[0].start, box[1].start])
-    place = ground.centres_m(*(np.array([at]) + start for at, start in zip(deepest, origin.tolist(), strict=True)))
+    place = ground.centres_m(*(deepest + origin)[:, np.newaxis])
     sample = ground.centres_m(rows[::step] + origin[0], columns[::step] + origin[1])
-    width_m = (2.0 * float(depth.max()) - 1.0) * ground.cell_m
+    width_m = (2.0 * float(depth.max()) - every) * ground.cell_m
     return Gap(area_m2, width_m, float(np.hypot(*mask.shape)) * ground.cell_m, place[0], sample)
 
 
 def densities(ground: Ground, wanted: BoolArray) -> FloatArray:
     """Return first returns on a square metre (n,) of the blocks that lie in the wanted cells and are covered wholly."""
     block = ground.block
-    whole = _whole(wanted & ground.covered, block)
+    whole = wanted & ground.covered
+    for _ in range(block.bit_length() - 1):  # a power of two
+        whole = ~_joined(~whole)
     size_m2 = (block * ground.cell_m) ** 2
     found: FloatArray = ground.pulses[whole] / size_m2
     return found
-
-
-def _whole(mask: BoolArray, block: int) -> Any:
-    rows, columns = mask.shape
-    return mask.reshape(rows // block, block, columns // block, block).all(axis=(1, 3))

@@ -33,7 +33,7 @@ from swath.daemon.processing.landing.checks import (
 )
 from swath.daemon.processing.landing.command import VERDICT, VERSION
 from swath.daemon.processing.landing.facts import LogFacts
-from swath.daemon.processing.landing.gaps import Gap, Painted, between, densities, gaps_of, inside
+from swath.daemon.processing.landing.gaps import Gap, Ground, Painted, between, densities, gaps_of, inside
 from swath.daemon.processing.landing.tracks import pairs_of, tracks_of
 from swath.daemon.processing.live.tiles import replace_file
 from swath.georef.arrays import BoolArray, FloatArray
@@ -59,34 +59,59 @@ class Places:
     geodetic_deg: Local | None
 
 
+class Outline:
+    """The area of a plan on the map; which cells lie inside is kept as long as the cells stay."""
+
+    def __init__(self, plan: FlightPlan | None, places: Places) -> None:
+        """Place an area; a plan without one has none.
+
+        Raises:
+            ValueError: the mapping frame has no place for it.
+        """
+        area = () if plan is None else plan.area
+        self.polygons = [[places.local_m(ring) for ring in rings] for rings in area]
+        self._key: tuple[float, ...] = ()
+        self._inside: BoolArray = np.zeros((0, 0), np.bool_)
+
+    def edges_m(self) -> FloatArray:
+        """Return west, south, east, north (4,)."""
+        corners = np.concatenate([ring for rings in self.polygons for ring in rings])
+        edges: FloatArray = np.concatenate([corners.min(axis=0), corners.max(axis=0)])
+        return edges
+
+    def wanted(self, ground: Ground) -> BoolArray:
+        """Return the cells (rows, columns) that should have points; without an area, those between points."""
+        if not self.polygons:
+            return between(ground)
+        key = ground.west_m, ground.south_m, ground.cell_m, *ground.covered.shape
+        if key != self._key:
+            self._key, self._inside = key, inside(ground, self.polygons)
+        return self._inside
+
+
 def covered_of(
-    painted: Painted, watch: LineWatch | StripWatch, plan: FlightPlan | None, places: Places, least_m2: float
+    painted: Painted, watch: LineWatch | StripWatch, outline: Outline, places: Places, least_m2: float
 ) -> Covered | None:
     """Return how the area is covered; None: there is no point yet, and no area.
 
     Args:
         painted: cells of the map.
         watch: the lines and their swaths.
-        plan: with the area; None: none is configured.
+        outline: the area.
         places: of the map's frame.
         least_m2: smaller gaps are not looked for.
     """
-    area = () if plan is None else plan.area
-    polygons = [[places.local_m(ring) for ring in rings] for rings in area]
-    edges_m = painted.edges_m()
-    if polygons:
-        outline = np.concatenate([ring for rings in polygons for ring in rings])
-        edges_m = np.concatenate([outline.min(axis=0), outline.max(axis=0)])
+    edges_m = outline.edges_m() if outline.polygons else painted.edges_m()
     if edges_m is None or not painted.has_points:
         return None
     if isinstance(watch, LineWatch):
         watch.refresh()
     ground = painted.ground(edges_m)
-    wanted = inside(ground, polygons) if polygons else between(ground)
+    wanted = outline.wanted(ground)
     gaps = gaps_of(ground, wanted, least_m2)
     cell_m2 = ground.cell_m**2
     return Covered(
-        bool(polygons),
+        bool(outline.polygons),
         float(wanted.sum()) * cell_m2,
         float((wanted & ground.covered).sum()) * cell_m2,
         ground.cell_m,
@@ -193,6 +218,7 @@ class Landing:
         self._corrections, self._calibration = list(corrections), calibration
         self._head = dict(head or {})
         self._painted = Painted()
+        self._outline: Outline | None = None
         self._saved_ns = -(1 << 62)
         self._marked_ns: int | None = None
 
@@ -282,9 +308,16 @@ class Landing:
             cells: side of the map's cells, and its tiles that have changed.
             watch, plan: the lines.
             places: of the map's frame; None: there is none yet.
+
+        Raises:
+            ValueError: the mapping frame has no place for the area.
         """
         self._painted.take(*cells)
-        return None if places is None else covered_of(self._painted, watch, plan, places, self._config.wanted.gap_m2)
+        if places is None:
+            return None
+        if self._outline is None:  # the map's frame never changes
+            self._outline = Outline(plan, places)
+        return covered_of(self._painted, watch, self._outline, places, self._config.wanted.gap_m2)
 
     def save(self, found: Mapping[str, Any], log_time_ns: int) -> None:
         """Replace the file ``verdict.json``.

@@ -12,7 +12,7 @@ from pyproj import Transformer
 from swath.daemon.log.format import SessionInfo
 from swath.daemon.processing.flightplan.plan import FlightPlan
 from swath.daemon.processing.landing.gaps import Painted
-from swath.daemon.processing.landing.watch import Landing, Places, covered_of
+from swath.daemon.processing.landing.watch import Landing, Outline, Places, covered_of
 from swath.daemon.processing.live.grid import CELL_DTYPE
 from swath.daemon.processing.live.tiles import SIDE
 from swath.georef.arrays import FloatArray, StructArray
@@ -102,5 +102,5 @@ def verdict_of(
     landing.facts.has_ended = True
     places = places_of(flight)
     found = plan or flight.plan
-    covered = covered_of(painted(rows, places), watched, found, places, flight.config.wanted.gap_m2)
+    covered = covered_of(painted(rows, places), watched, Outline(found, places), places, flight.config.wanted.gap_m2)
     return landing.verdict(watched, found, "", covered, DIFFERENCES, {"part": 0} | follower)

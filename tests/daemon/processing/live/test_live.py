@@ -29,7 +29,7 @@ from swath.daemon.log.reader import Session, open_logs
 from swath.daemon.processing.live import follow as live_follow
 from swath.daemon.processing.live import session as live_module
 from swath.daemon.processing.live.points import POINT_DTYPE
-from swath.daemon.processing.live.session import Live, LiveSession, Told, replay
+from swath.daemon.processing.live.session import Live, LiveSession, Told, made_session, replay
 from swath.daemon.processing.live.status import LiveStatus, sentence
 from swath.daemon.processing.live.tiles import Layers, TileReader
 from swath.daemon.processing.points.feed import TICK_BYTES, TICK_NS
@@ -169,6 +169,25 @@ class TestPoints:
         assert (tmp_path / "live/lines.json").read_bytes() == (replayed[0] / "lines.json").read_bytes()
         assert json.loads((tmp_path / "live/live.json").read_text()) == told[-1]
         assert sorted({int(one["part"]) for one in told if "part" in one}) == list(range(len(flown.paths)))
+
+    @pytest.mark.slow
+    def test_a_mark_has_the_verdict_written_at_once_and_printed(self, flown: Flown, tmp_path: Path) -> None:
+        """The mark comes after 3 s; without it the verdict would be 30 s old at most."""
+        session = flown.session()
+        run = made_session(flown.setup(), session.info, tmp_path, LiveConfig(), None, beside_recorder=True)
+        marked_ns = session.info.realtime_ns + 3_000_000_000
+        for batch in session.batches():
+            if run.landing.facts.marked_ns is None and run.now_ns > marked_ns:
+                run.landing.facts.event(run.now_ns, {"code": "mark", "text": "landing: You can go home"})
+                run.take(batch, live=True)
+                verdict = json.loads((tmp_path / "verdict.json").read_text())
+                continue
+            run.take(batch, live=True)
+        assert verdict["log_time_ns"] == pytest.approx(marked_ns, abs=1e9)
+        assert verdict["state"] == "again"  # whatever the mark says
+        run.close(live=True)
+        assert (tmp_path / "landing.pdf").read_bytes().startswith(b"%PDF-")
+        assert "Fly again: line 1. Not flown: line 2." in (tmp_path / "landing.html").read_text()
 
     def test_bytes_do_not_depend_on_how_the_log_is_cut(
         self, flown: Flown, replayed: tuple[Path, Told], tmp_path: Path
