@@ -31,6 +31,12 @@ def command(
         typer.Option("--output", "-o", metavar="NAME.html", help="Also write a page, and its PDF beside it."),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files of an earlier run.")] = False,
+    predict: Annotated[
+        bool,
+        typer.Option(
+            "--predict/--no-predict", help="Predict what the lines flown determine of the calibration: half a minute."
+        ),
+    ] = True,
     as_json: Annotated[bool, typer.Option("--json", help="Print the verdict as one JSON object.")] = False,
 ) -> None:
     """Say before landing whether to fly again or to go home, and why.
@@ -46,6 +52,7 @@ def command(
         raise UserError(f"-o: got {one_line(str(output))}, want a name that ends in {HTML}", ExitCode.USAGE)
     live = _folder(where)
     found = read_verdict(live)
+    found["predicted"] = _predicted(live, str(found.get("session_id")), predict=predict)
     warnings: list[str] = []
     written = [] if output is None else _write(live, found, output, warnings, overwrite=overwrite)
     if as_json:
@@ -64,10 +71,27 @@ def _folder(where: Path) -> Path:
     return where if (where / VERDICT).is_file() else log_directory(where) / LIVE
 
 
+def _predicted(live: Path, session_id: str, *, predict: bool) -> dict[str, Any]:
+    """Return what the lines flown would determine of the calibration, or the last prediction of it."""
+    from swath.daemon.processing.landing.command import PREDICTED
+
+    if not predict:
+        try:
+            found = json.loads((live / PREDICTED).read_bytes())
+        except (OSError, ValueError):
+            return {}
+        return found if isinstance(found, dict) else {}
+    from swath.daemon.processing.landing.predict import prediction_of
+
+    return prediction_of(live, live.parent, session_id)
+
+
 def _lines(found: dict[str, Any]) -> list[str]:
+    from swath.daemon.processing.landing.page import prediction_lines
+
     width = max(len(check["title"]) for check in found["checks"])
     checks = [f"{check['title']:{width}}  {check['state']:7}  {check['text']}" for check in found["checks"]]
-    return [found["sentence"], *checks]
+    return [found["sentence"], *checks, *prediction_lines(found["predicted"])]
 
 
 def _write(live: Path, found: dict[str, Any], page: Path, warnings: list[str], *, overwrite: bool) -> list[Path]:

@@ -14,7 +14,7 @@ from typing import Any
 from swath.daemon.console.background import Background
 from swath.daemon.console.painting import Painter
 from swath.daemon.monitor.display import DEGRADED, NOT_RECORDING, RECORDING, Monitor, follower_of, news
-from swath.daemon.processing.landing.command import VERDICT
+from swath.daemon.processing.landing.command import PREDICTED, VERDICT
 
 EVERY_S = 1.0
 STEERING_S = 0.2  # live writes it five times a second
@@ -126,7 +126,7 @@ class Watch(threading.Thread):
         self.steering: Plain = {}
         self._live, self._lines = JsonFile(live / LIVE_STATUS), JsonFile(live / LIVE_LINES)
         self._steering = JsonFile(live / LIVE_STEERING)
-        self.live, self._verdict = live, JsonFile(live / VERDICT)
+        self.live, self._verdict, self._predicted = live, JsonFile(live / VERDICT), JsonFile(live / PREDICTED)
         self.looks = {name: LookFile(live / file, kind) for name, (file, kind) in LOOKS.items()}
         self.tell = tell
         self._events = Numbered()
@@ -190,10 +190,16 @@ class Watch(threading.Thread):
         self.latest = snapshot
 
     def verdict(self) -> tuple[Plain | None, str]:
-        """Return live's newest verdict before landing, and its sign, which changes with it; None, no sign: none."""
+        """Return live's newest verdict before landing, and its sign, which changes with it; None, no sign: none.
+
+        ``predicted`` is what the lines flown would determine of the calibration, if live has computed it.
+        """
         with self._reading:
-            content = self._verdict.content()
-            return content, "" if content is None else self._verdict.sign
+            content, predicted = self._verdict.content(), self._predicted.content()
+            if content is None:
+                return None, ""
+            sign = self._verdict.sign if predicted is None else f"{self._verdict.sign}.{self._predicted.sign}"
+            return content | {"predicted": predicted or {}}, sign
 
     def _landing(self) -> Plain | None:
         """Return the verdict in short, for every page."""

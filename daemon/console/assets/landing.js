@@ -45,10 +45,18 @@ function list(first, lines) {
 
 const size = (m2) => (m2 < 1e4 ? `${number(m2)} m²` : m2 < 1e6 ? `${number(m2 / 1e4, 1)} ha` : `${number(m2 / 1e6, 2)} km²`);
 
-function showChecks(checks) {
+const digits = (sigma) => (sigma === null ? "none" : sigma >= 100 ? number(sigma) : String(Number(sigma.toPrecision(2))));
+
+function predictions(predicted) {
+  return (predicted?.rows ?? []).map((one) =>
+    `${one.scanner} ${one.name}: ${digits(one.sigma)} ${one.unit} by the lines flown, ${one.wanted} is useful: ${one.determined ? "determined" : "not shown to be determined"}`);
+}
+
+function showChecks(checks, predicted) {
   $("check-rows").replaceChildren(...checks.map((check) => {
     const [shape, words, name] = ANSWERS[check.state] ?? ["?", check.state, "warn"];
-    const details = ["gaps", "lines"].includes(check.code) ? [] : check.details;
+    const details = ["gaps", "lines"].includes(check.code) ? [] : [...check.details];
+    if (check.code === "calibration") details.push(...predictions(predicted));
     return row(check.title, [`${shape} ${words}`, name], list(check.text, details));
   }));
 }
@@ -84,7 +92,7 @@ function show(found) {
   text("state", words);
   text("sentence", verdict ? verdict.sentence : "swath live has written no verdict");
   document.title = `${shape} ${words} – Swath before landing`;
-  showChecks(verdict?.checks ?? []);
+  showChecks(verdict?.checks ?? [], verdict?.predicted);
   showGaps(verdict?.area);
   showLines(verdict?.lines ?? []);
   $("downloads").replaceChildren(...found.downloads.map((file) => {

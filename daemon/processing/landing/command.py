@@ -12,6 +12,7 @@ from pathlib import Path
 
 VERDICT = "verdict.json"
 VERSION = 1
+FLOWN, PREDICTED = "flown.npz", "calibration.json"
 PAGE, PRINTED = "landing.html", "landing.pdf"
 LIVE = "live"  # folder of live's files in the log directory
 MARK = "landing:"  # begins the text of the mark with which the operator writes the verdict into the log
@@ -20,10 +21,14 @@ HOME, FLY_AGAIN, WAIT = "home", "again", "wait"  # of the verdict
 PRINT_S = 120.0  # after which printing has failed
 
 
-def page_command(live: Path, page: Path) -> list[str]:
-    """Return the command that writes the page of a folder of live's files, and its PDF beside it."""
+def page_command(live: Path, page: Path, *, predict: bool = False) -> list[str]:
+    """Return the command that writes the page of a folder of live's files, and its PDF beside it.
+
+    With ``predict`` the calibration is predicted anew, which takes half a minute; otherwise the last prediction counts.
+    """
     program = [sys.executable, "-m", "swath.daemon.cli.main", "landing"]
-    return [*program, str(live), "--output", str(page), "--overwrite"]
+    options = ["--output", str(page), "--overwrite", *([] if predict else ["--no-predict"])]
+    return [*program, str(live), *options]
 
 
 class PagePrinter:
@@ -36,12 +41,12 @@ class PagePrinter:
     def __init__(self, live: Path) -> None:
         self._live = live
         self._process: subprocess.Popen[bytes] | None = None
-        self._waits = False
+        self._waits = self._predicts = False
         self.has_printed = False
 
-    def ask(self) -> None:
-        """Have the page written, as soon as the process before has ended."""
-        self._waits = True
+    def ask(self, *, predict: bool = True) -> None:
+        """Have the page written, as soon as the process before has ended; predict the calibration before, or not."""
+        self._waits, self._predicts = True, predict
         self.look()
 
     def look(self) -> None:
@@ -51,18 +56,24 @@ class PagePrinter:
         self._waits = False
         with contextlib.suppress(OSError):  # no memory, no processes: the verdict itself is written
             null = subprocess.DEVNULL
-            self._process = subprocess.Popen(
-                page_command(self._live, self._live / PAGE), stdin=null, stdout=null, stderr=null
-            )
+            command = page_command(self._live, self._live / PAGE, predict=self._predicts)
+            self._process = subprocess.Popen(command, stdin=null, stdout=null, stderr=null)
             self.has_printed = True
 
-    def finish(self, wait_s: float) -> None:
-        """Wait for what is being written, and for what waits; end it after ``wait_s`` for each."""
+    def finish(self, wait_s: float) -> bool:
+        """Wait for what is being written, and for what waits; end it after ``wait_s`` for each.
+
+        Returns:
+            True if the last page was written wholly.
+        """
+        done = True
         for _ in range(2):
             if self._process is not None:
                 try:
-                    self._process.wait(wait_s)
+                    done = self._process.wait(wait_s) in (0, 1)  # 1: something is to be flown again
                 except subprocess.TimeoutExpired:
                     self._process.kill()
                     self._process.wait()
+                    done = False
             self.look()
+        return done

@@ -16,6 +16,7 @@ import numpy as np
 from swath.daemon.log.words import source_trouble
 from swath.daemon.processing.flightplan.moments import empty_moments
 from swath.daemon.processing.landing.command import MARK
+from swath.daemon.processing.landing.flown import FlownTrack
 from swath.georef.arrays import Int64Array, StructArray
 from swath.georef.geodesy.earth import e_from_geodetic
 from swath.georef.records import FixType, GnssFix
@@ -127,7 +128,7 @@ class LogFacts:
         read_from_ns: log time of the first message that was read.
         missed_ns: log time of a scanner's data that were recorded before live began, at least.
         marked_ns: log time of the newest mark that asks for the verdict; None: there is none.
-        track: rows of `flightplan.moments`, one a second.
+        flown: what a prediction of the calibration needs.
     """
 
     begun_ns: int
@@ -142,6 +143,7 @@ class LogFacts:
     missed_ns: int = 0
     marked_ns: int | None = None
     has_ended: bool = False
+    flown: FlownTrack = field(default_factory=FlownTrack)
     _recorded_ns: dict[str, int] = field(default_factory=dict)
     _seen: set[str] = field(default_factory=set)
     _rows: list[StructArray] = field(default_factory=list)

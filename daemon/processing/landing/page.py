@@ -47,6 +47,21 @@ STATES = {
 }
 ANSWERS = {GOOD: "good", REMARK: "look at it", AGAIN: "fly again", UNKNOWN: "not known", OPEN: "still to do"}
 HEAD = ("aircraft", "author", "crs", "calibrations")  # of a page's head, as live knows them
+KEYS = {
+    "omega_deg": "roll (ω)",
+    "phi_deg": "pitch (φ)",
+    "kappa_deg": "heading (κ)",
+    "range_offset_m": "range offset",
+    "range_scale_ppm": "range scale",
+    "scan_angle_scale_ppm": "scan-angle scale",
+    "scan_plane_tilt_deg": "scan-plane tilt",
+    "time_offset_us": "time offset",
+}
+PREDICTED_HOW = (
+    "By the equations of swath plan-calibration, for {strips} strips and {planes} squares of the map that lie in one "
+    "plane, with live's sigmas. Roofs smaller than three cells of the map are not among them, and the office smooths "
+    "the trajectory: swath calibrate may determine more, hardly less."
+)
 ALT = "Map of the lines, the area and the gaps"
 LEGEND = (
     "Pale: cells with points, darker where several strips have some. Red: cells that have none and should. "
@@ -109,6 +124,7 @@ def landing_page(live: Path, found: Mapping[str, Any]) -> str:
         ),
         *_gaps(found),
         _lines(found),
+        *_prediction(found.get("predicted") or {}),
     ]
     page = Page(
         "Before landing",
@@ -178,6 +194,34 @@ def _lines(found: Mapping[str, Any]) -> Table:
         flown = "" if line["flown_fraction"] is None else f"{100 * line['flown_fraction']:.0f} %"
         rows.append([line["name"], said, flown, "; ".join(why)])
     return Table("Lines", ("line", "state", "flown", "why"), rows, left=(0, 1, 3))
+
+
+def _prediction(predicted: Mapping[str, Any]) -> list[Block]:
+    title = "Calibration by the lines flown"
+    if not predicted.get("rows"):
+        return [Words(f"Not predicted: {predicted['why']}.", title, muted=True)] if predicted.get("why") else []
+    rows: list[list[Cell]] = []
+    for row in predicted["rows"]:
+        verdict: Cell = Judged("yes", good=True) if row["determined"] else "not shown"
+        words = f"{row['scanner']} {KEYS.get(row['name'], row['name'])}"
+        rows.append([words, row["unit"], _digits(row["sigma"]), f"{row['wanted']:g}", verdict])
+    heads = ("parameter", "unit", "predicted sigma", "largest useful sigma", "determined")
+    return [Table(title, heads, rows, PREDICTED_HOW.format(**predicted))]
+
+
+def prediction_lines(predicted: Mapping[str, Any]) -> list[str]:
+    """Return the prediction for a terminal, a line for each parameter."""
+    if not predicted.get("rows"):
+        return [f"calibration by the lines flown: not predicted, {predicted['why']}"] if predicted.get("why") else []
+    return [
+        f"{row['scanner']} {row['name']}: {_digits(row['sigma'])} {row['unit']} by the lines flown, {row['wanted']:g} "
+        f"is useful: {'determined' if row['determined'] else 'not shown to be determined'}"
+        for row in predicted["rows"]
+    ]
+
+
+def _digits(sigma: float | None) -> str:
+    return "none" if sigma is None else f"{sigma:.0f}" if sigma >= 100.0 else f"{sigma:.2g}"
 
 
 # ---------------------------------------------------------------------------------------------- map

@@ -27,12 +27,15 @@ class Track:
         begin_m, end_m: (2,) east and north.
         above_m: median height above the ground; nan: unknown.
         half_m: half the swath's width.
+        begin_ns, end_ns: GPS times.
     """
 
     begin_m: FloatArray
     end_m: FloatArray
     above_m: float
     half_m: float
+    begin_ns: int = 0
+    end_ns: int = 0
 
     @property
     def length_m(self) -> float:
@@ -76,9 +79,9 @@ def tracks_of(rows: StructArray) -> list[Track]:
             continue
         strip = rows[at]
         half_m = _median((strip["right_m"] - strip["left_m"]) / 2.0)
-        found.append(
-            Track(places[at[0]], places[at[-1]], _median(strip["above_m"]), 0.0 if math.isnan(half_m) else half_m)
-        )
+        half_m = 0.0 if math.isnan(half_m) else half_m
+        times = int(strip["gps_ns"][0]), int(strip["gps_ns"][-1])
+        found.append(Track(places[at[0]], places[at[-1]], _median(strip["above_m"]), half_m, *times))
     return found
 
 

@@ -319,6 +319,14 @@ class Landing:
             self._outline = Outline(plan, places)
         return covered_of(self._painted, watch, self._outline, places, self._config.wanted.gap_m2)
 
+    def save_flown(self) -> None:
+        """Write what a prediction of the calibration needs.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        self.facts.flown.save(self._path.parent, tracks_of(self.facts.track))
+
     def save(self, found: Mapping[str, Any], log_time_ns: int) -> None:
         """Replace the file ``verdict.json``.
 

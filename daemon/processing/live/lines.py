@@ -22,7 +22,7 @@ from swath.daemon.processing.flightplan.watch import LineWatch
 from swath.daemon.processing.landing.facts import LogFacts
 from swath.daemon.processing.live.frame import LocalFrame
 from swath.daemon.processing.live.tiles import replace_file
-from swath.daemon.processing.points.feed import Placed
+from swath.daemon.processing.points.feed import TICK_NS, Placed
 from swath.daemon.processing.setup.setup import Setup
 from swath.drivers.parser import Parser
 from swath.georef.arrays import FloatArray, StructArray
@@ -79,6 +79,7 @@ class LiveLines:
         self._next_ns = self._steered_ns = -(1 << 62)
         self._fixes: dict[str, tuple[FixType, int]] = {}  # by receiver: quality and host time of the newest position
         self._seen: dict[str, list[int]] = {}  # by scanner: returns, and pulses without one, since the last tick
+        self._ticked: set[str] = set()  # scanners with returns since the last tick
         self._lost = Counter[str]()
         self._lost_before = Counter[str]()
         self._tick_ns = self._saved_ns = 0
@@ -118,6 +119,8 @@ class LiveLines:
             seen = self._seen.setdefault(source.removeprefix("scanner/"), [0, 0])
             returns = int(np.count_nonzero(record.rows["number_of_returns"]))
             seen[0] += returns
+            self._ticked.update([source.removeprefix("scanner/")] * (returns > 0))
+            self._facts.flown.returns(source.removeprefix("scanner/"), record.rows)
             seen[1] += len(record.rows) - returns
         elif isinstance(record, GnssFix) and (record.lat_rad is not None or record.fix_type is FixType.NONE):
             self._facts.fix(source, record)
@@ -127,6 +130,8 @@ class LiveLines:
     def tick(self, tick_ns: int | None, placed: Placed) -> None:
         """Take the points of a tick, and the poses that became known at it."""
         self._tick_ns = self._tick_ns if tick_ns is None else tick_ns
+        self._facts.flown.tick(list(self._ticked), TICK_NS / SECOND_NS)
+        self._ticked.clear()
         if self.parser is not None:
             for name in self._stream.scanners:
                 errors = self.parser(f"scanner/{name}").counters.errors
@@ -162,6 +167,7 @@ class LiveLines:
             return empty_moments(0)
         self._next_ns = int(times[-1]) + STEP_NS
         poses = trajectory.poses(times)
+        self._facts.flown.poses(times, poses)
         rows = empty_moments(len(times))
         lat, lon, height = geodetic_from_e(poses.position_e)
         rot_l_from_e = rot_e_from_l(lat, lon).swapaxes(-1, -2)

@@ -167,7 +167,7 @@ class LiveSession:
         if self.landing.is_due(self.now_ns):
             self._save_verdict(live=live)
 
-    def _save_verdict(self, *, live: bool) -> None:
+    def _save_verdict(self, *, live: bool, last: bool = False) -> None:
         """Write the verdict before landing, unless free space is low."""
         if not self.products.room.is_enough:
             return
@@ -178,6 +178,8 @@ class LiveSession:
             lines.watch, lines.plan, lines.trouble, found, comparison.total.numbers(), self.log_state
         )
         try:
+            if is_asked or last:
+                self.landing.save_flown()
             self.landing.save(verdict, self.now_ns)
         except OSError as error:
             self.products.trouble = f"{VERDICT}: {error.strerror or error}: the verdict is not written"
@@ -189,12 +191,12 @@ class LiveSession:
         """Write the page of the last verdict, and its PDF if the operator has asked for it during the flight."""
         if not self.products.room.is_enough:
             return
-        if live and self.printer.has_printed:
-            self.printer.ask()
-            self.printer.finish(PRINT_WAIT_S)
-            return
-        with contextlib.suppress(UserError):  # there is none, as products.trouble says
+        with contextlib.suppress(UserError, OSError):  # there is none, as products.trouble says
             replace_file(self.folder / PAGE, landing_page(self.folder, read_verdict(self.folder)).encode())
+        if live and self.printer.has_printed:
+            self.printer.ask(predict=False)  # a prediction takes longer than the service may
+            if not self.printer.finish(PRINT_WAIT_S):
+                (self.folder / PRINTED).unlink(missing_ok=True)  # it is of an earlier verdict
 
     def _covered(self) -> Covered | None:
         """Return how the area is covered; None: nothing is known of it."""
@@ -247,7 +249,7 @@ class LiveSession:
         self.products.map.end()
         self.products.save_map({"session_id": self.info.session_id}, self.now_ns, last=True)
         self._save_lines(last=True)
-        self._save_verdict(live=live)
+        self._save_verdict(live=live, last=True)
         self.print_verdict(live=live)
         self.products.close()
         if self.points is not None:

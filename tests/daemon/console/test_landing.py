@@ -34,10 +34,16 @@ def aircraft(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Asked, 
 
 
 def test_the_verdict_is_served_as_live_wrote_it_and_told_to_all_pages(aircraft: tuple[Asked, Path]) -> None:
-    asked, _ = aircraft
+    asked, logs = aircraft
     found = asked.get("/verdict").plain()
-    assert found["verdict"] == verdict(note=SCRIPT)
+    assert found["verdict"] == verdict(note=SCRIPT) | {"predicted": {}}
     short = asked.snapshot()["landing"]
+    row = {"scanner": "left", "name": "omega_deg", "unit": "°", "sigma": 0.004, "wanted": 0.005, "determined": True}
+    predicted = {"strips": 3, "planes": 80, "rows": [row]}
+    (logs / "live/calibration.json").write_text(json.dumps(predicted))
+    later = asked.get("/verdict").plain()
+    assert later["verdict"]["predicted"] == predicted
+    assert later["sign"] != found["sign"]
     assert short == {"sign": found["sign"], "state": "again", "sentence": "Fly again: line 9"}
 
 
@@ -102,6 +108,7 @@ def test_page_and_pdf_are_made_once_for_each_verdict(aircraft: tuple[Asked, Path
     assert page.status == 200
     text = page.body.decode()
     assert "Fly again: line 9." in text
+    assert "left roll (ω)" in text
     assert SCRIPT not in text
     assert "attachment" in page.headers["content-disposition"]
     assert asked.get("/landing.pdf").body == pdf.body

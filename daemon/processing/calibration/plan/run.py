@@ -193,7 +193,7 @@ def plan_calibration(plan: Plan, request: PlanOptions, tell: Tell = silent) -> P
         raise UserError(one_line(str(error)), ExitCode.USAGE) from error
     used = sum(len(plane.control) for plane in features.planes)
     unplanned = tuple(tables_in_words(request.model))
-    return PlannedCalibration(survey, flight, features, predicted, _rows(predicted), sigmas, used, unplanned)
+    return PlannedCalibration(survey, flight, features, predicted, rows_of(predicted), sigmas, used, unplanned)
 
 
 def _by_the_grade(plan: Plan) -> tuple[float, float, float]:
@@ -204,7 +204,7 @@ def _gps(time_s: float) -> int:
     return BEGIN_NS + round(time_s * SECOND_NS)
 
 
-def _rows(predicted: Predicted) -> list[dict[str, Any]]:
+def rows_of(predicted: Predicted) -> list[dict[str, Any]]:
     """Return one row per parameter, in files' units, in the order of the model."""
     by_name = {parameter.name: (index, parameter) for index, parameter in enumerate(PARAMETERS)}
     found: list[tuple[str, float, FixedParameter | None]] = [
