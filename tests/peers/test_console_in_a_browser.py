@@ -483,6 +483,22 @@ def test_the_verdict_before_landing_is_read_printed_and_written_into_the_log(
     assert opened.errors == []
 
 
+def test_going_home_is_blue_only_where_nothing_is_open_to_doubt(
+    tmp_path: Path, open_page: Callable[..., Opened]
+) -> None:
+    (tmp_path / "live").mkdir()
+    path = tmp_path / "live/verdict.json"
+    home = verdict() | {"state": "home", "sentence": "You can go home"}
+    with console(tmp_path) as (asked, _):
+        page = open_page(asked.url + "/landing").page
+        expect(page.locator("#state")).to_have_text("NO VERDICT", timeout=WAIT_MS)
+        for unknown, state in (("unknown", "GO HOME, WITH CARE"), ("good", "GO HOME"), ("open", "GO HOME")):
+            checks = [home["checks"][2], home["checks"][3] | {"state": unknown}]
+            path.write_text(json.dumps(home | {"checks": checks, "area": None, "lines": []}))
+            expect(page.locator("#state")).to_have_text(state, timeout=WAIT_MS)
+            expect(page.locator("#gaps-note")).to_have_text("No point yet")
+
+
 def test_the_operator_overrules_a_line_by_the_panel(
     aircraft: tuple[Asked, Path], open_page: Callable[..., Opened]
 ) -> None:

@@ -1,13 +1,23 @@
 // The page before landing: may we go home? It shows what live has judged, and asks for it to be written down.
 import { ask, begin, clock, listen, number, pressed, text } from "./feed.js";
 
-const VERDICTS = { home: ["●", "GO HOME"], again: ["■", "FLY AGAIN"], wait: ["▲", "WAIT"] };
+const VERDICTS = { home: ["●", "GO HOME"], care: ["▲", "GO HOME, WITH CARE"], again: ["■", "FLY AGAIN"], wait: ["▲", "WAIT"] };
 const ANSWERS = {
   good: ["●", "good", "good"],
   remark: ["▲", "look at it", "warn"],
   again: ["■", "fly again", "bad"],
   unknown: ["?", "not known", "warn"],
   open: ["○", "still to do", "warn"],
+};
+const PARAMETERS = {
+  omega_deg: "roll (ω)",
+  phi_deg: "pitch (φ)",
+  kappa_deg: "heading (κ)",
+  range_offset_m: "range offset",
+  range_scale_ppm: "range scale",
+  scan_angle_scale_ppm: "scan-angle scale",
+  scan_plane_tilt_deg: "scan-plane tilt",
+  time_offset_us: "time offset",
 };
 const LINES = {
   planned: ["not flown", "bad"],
@@ -49,7 +59,7 @@ const digits = (sigma) => (sigma === null ? "none" : sigma >= 100 ? number(sigma
 
 function predictions(predicted) {
   return (predicted?.rows ?? []).map((one) =>
-    `${one.scanner} ${one.name}: ${digits(one.sigma)} ${one.unit} by the lines flown, ${one.wanted} is useful: ${one.determined ? "determined" : "not shown to be determined"}`);
+    `${one.scanner} ${PARAMETERS[one.name] ?? one.name}: ±${digits(one.sigma)} ${one.unit} by the lines flown, ±${one.wanted} is useful: ${one.determined ? "determined" : "not shown to be determined"}`);
 }
 
 function showChecks(checks, predicted) {
@@ -86,8 +96,10 @@ function showLines(lines) {
 
 function show(found) {
   const verdict = found.verdict;
-  const [shape, words] = VERDICTS[verdict?.state] ?? ["?", "NO VERDICT"];
-  $("header").dataset.state = verdict?.state ?? "UNKNOWN";
+  const doubts = (verdict?.checks ?? []).some((check) => ["remark", "unknown"].includes(check.state));
+  const state = verdict?.state === "home" && doubts ? "care" : verdict?.state;
+  const [shape, words] = VERDICTS[state] ?? ["?", "NO VERDICT"];
+  $("header").dataset.state = state ?? "UNKNOWN";
   text("state-shape", shape);
   text("state", words);
   text("sentence", verdict ? verdict.sentence : "swath live has written no verdict");

@@ -214,8 +214,8 @@ def prediction_lines(predicted: Mapping[str, Any]) -> list[str]:
     if not predicted.get("rows"):
         return [f"calibration by the lines flown: not predicted, {predicted['why']}"] if predicted.get("why") else []
     return [
-        f"{row['scanner']} {row['name']}: {_digits(row['sigma'])} {row['unit']} by the lines flown, {row['wanted']:g} "
-        f"is useful: {'determined' if row['determined'] else 'not shown to be determined'}"
+        f"{row['scanner']} {KEYS.get(row['name'], row['name'])}: ±{_digits(row['sigma'])} {row['unit']} by the lines "
+        f"flown, ±{row['wanted']:g} is useful: {'determined' if row['determined'] else 'not shown to be determined'}"
         for row in predicted["rows"]
     ]
 
