@@ -21,7 +21,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-peers test-vm test-vm-long test-arm64 test-long soak soak-short fuzz lint ready bench bench-calibration install uninstall clean
+.PHONY: help demo test test-slow test-peers test-vm test-vm-long test-arm64 test-long soak soak-short fuzz lint ready programs for-tiers for-peers for-vm bench bench-calibration install uninstall clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -38,19 +38,14 @@ test-slow: $(VENV)/.tests $(VENV)/.tools ready ## run the longer tests: whole fl
 	$(PYTEST) -n $(JOBS) $(SHARED) -m "slow and not long and not alone and not peers"
 	$(call PYTEST,-alone) -n 0 -m "alone and slow and not long"
 
-test-peers: $(VENV)/.tests ## run the tests against gpsd, Foxglove's reader and Chromium, which it installs (root, apt, npm)
-	@for program in gpsd npm chromium; do command -v $$program >/dev/null || \
-		{ apt-get -qq update && apt-get -qq install -y --no-install-recommends $$program >/dev/null; } || exit; done
-	npm ci --silent --no-audit --no-fund --prefix tests/peers
+test-peers: $(VENV)/.tests for-peers ## run the tests against gpsd, Foxglove's reader and Chromium, which it installs (root, apt, npm)
 	$(PYTEST) -n 0 -v tests/peers
 
-test-vm: $(VENV)/.tests ## run the tests of CAN, PPS, systemd and power cuts in a virtual machine, which it installs (root, apt, alone)
-	@bash tests/vm/setup.sh
+test-vm: $(VENV)/.tests for-vm ## run the tests of CAN, PPS, systemd and power cuts in a virtual machine, which it installs (root, apt, alone)
 	$(PYTEST) -n 2 --dist loadfile -v -m "not alone and not long" tests/vm
 	$(call PYTEST,-alone) -n 0 -v -m "alone and not long" tests/vm
 
-test-vm-long: $(VENV)/.tests ## run the same with 50 power cuts and three minutes of flight
-	@bash tests/vm/setup.sh
+test-vm-long: $(VENV)/.tests for-vm ## run the same with 50 power cuts, 20 kills of the console and three minutes of flight
 	$(PYTEST) -n 2 --dist loadfile -v -m "not alone" tests/vm
 	$(call PYTEST,-alone) -n 0 -v -m alone tests/vm
 
@@ -83,6 +78,20 @@ ready: $(VENV)/.tests
 	$(BIN)/python -m swath.daemon.cli.main warm-up
 	@folder=$$(mktemp -d) && $(BIN)/python -m swath.daemon.cli.main sim fly small --seconds 14 -o $$folder >/dev/null; rm -r $$folder
 	@$(BIN)/python -m pytest -p no:cacheprovider -n 0 -q --collect-only >/dev/null || true
+
+# what all tiers need; apt and pip install beside each other
+programs: $(VENV)/.tests for-tiers
+
+for-tiers: $(VENV)/.tools
+	@$(MAKE) for-peers && $(MAKE) for-vm
+
+for-peers:
+	@for program in gpsd npm chromium; do command -v $$program >/dev/null || \
+		{ apt-get -qq update && apt-get -qq install -y --no-install-recommends $$program >/dev/null; } || exit; done
+	npm ci --silent --no-audit --no-fund --prefix tests/peers
+
+for-vm:
+	@bash tests/vm/setup.sh
 
 bench: $(VENV)/.tests ## measure speed, and compare each figure with the limit of this computer
 	$(BIN)/python -m benchmarks

@@ -20,6 +20,8 @@ LOGS = aircraft.LOGS
 DISK_MB = 256
 COMES_BACK_S = 400.0  # measures nothing
 KILLS = 10
+CONSOLE_KILLS, CONSOLE_KILLS_LONG = 5, 20
+CONSOLE = "http://127.0.0.1:8470"
 SESSION = "split_minutes = 1440\n"
 # a device without a driver, recorded by a second recorder
 TAIL = """\
@@ -288,6 +290,44 @@ def test_killing_the_live_service_repeatedly_does_not_affect_the_log(service: Ma
     service.until(f"[ $({killed}) = {before + KILLS // 2} ]")
     assert shown(service, "MainPID") == pid
     assert newest_log(service) == first
+    service.told("sleep 2")
+    found = aircraft.numbers([fetched(service, place) / first])
+    for kind in ("udp", "can"):
+        assert aircraft.missing(found[kind]) == [], kind
+
+
+@pytest.fixture
+def console(service: Machine) -> Iterator[str]:
+    """Run with the console's service; return a command that prints the first snapshot that it feeds to a page."""
+    service.told("systemctl start swath-console", COMES_BACK_S)
+    # the feed never ends: its first event is enough
+    yield f"{{ curl -sN -m 60 {CONSOLE}/feed || true; }} | grep -m 1 ^data:"
+    service.told("systemctl stop swath-console")
+
+
+@pytest.mark.usefixtures("without_live")
+def test_the_console_s_service_shows_the_recording_and_writes_marks(service: Machine, console: str) -> None:
+    assert shown(service, "User", "swath-console") == "swath-console"
+    assert "<title>" in service.told(f"curl -sf {CONSOLE}/")
+    header = json.loads(service.told(console).removeprefix("data:"))["header"]
+    assert header["state"] != "NOT RECORDING"
+    asked = f"-H 'Origin: {CONSOLE}' -H 'Content-Type: application/json' -d '{{\"text\": \"from the console\"}}'"
+    assert json.loads(service.told(f"curl -sf {asked} {CONSOLE}/mark"))["text"] == "from the console"
+
+
+@pytest.mark.usefixtures("without_live")
+@pytest.mark.parametrize("kills", [CONSOLE_KILLS, pytest.param(CONSOLE_KILLS_LONG, marks=pytest.mark.long)])
+def test_killing_the_console_repeatedly_does_not_affect_the_log(
+    service: Machine, place: Path, console: str, kills: int
+) -> None:
+    pid, first, moments = shown(service, "MainPID"), newest_log(service), random.Random(kills)
+    before = int(shown(service, "NRestarts", "swath-console"))
+    for number in range(1, kills + 1):
+        service.told(f"sleep {moments.uniform(0, 3):.2f}; systemctl kill -s KILL swath-console")
+        service.until(f"[ $(systemctl show -P NRestarts swath-console) = {before + number} ]")
+    service.until(f"curl -sf -m 60 -o /dev/null {CONSOLE}/", COMES_BACK_S)
+    assert json.loads(service.told(console).removeprefix("data:"))["header"]["state"] != "NOT RECORDING"
+    assert (shown(service, "MainPID"), newest_log(service)) == (pid, first)
     service.told("sleep 2")
     found = aircraft.numbers([fetched(service, place) / first])
     for kind in ("udp", "can"):
