@@ -55,7 +55,7 @@ def command(
     from swath.daemon.config.tables import ConsoleConfig
     from swath.daemon.console.rasters import open_raster
     from swath.daemon.console.serve import pairing_text, serve
-    from swath.daemon.processing.live.session import FOLDER
+    from swath.daemon.processing.live.tiles import FOLDER
 
     words = list(where or [])
     pairs = words[:1] == [PAIR]
@@ -102,7 +102,7 @@ def _replay(paths: list[Path], listen: str | None, pace: float, background: Path
     from swath.daemon.console.serve import serve
     from swath.daemon.console.watch import LIVE_STATUS
     from swath.daemon.log.reader import open_logs
-    from swath.daemon.processing.live.session import FOLDER
+    from swath.daemon.processing.live.tiles import FOLDER
     from swath.daemon.processing.user_errors import as_user_error
 
     if not paths:

@@ -66,9 +66,10 @@ def command(
 
 
 def _folder(where: Path) -> Path:
-    from swath.daemon.processing.landing.command import LIVE, VERDICT
+    from swath.daemon.processing.landing.command import VERDICT
+    from swath.daemon.processing.live.tiles import FOLDER
 
-    return where if (where / VERDICT).is_file() else log_directory(where) / LIVE
+    return where if (where / VERDICT).is_file() else log_directory(where) / FOLDER
 
 
 def _predicted(live: Path, session_id: str, *, predict: bool) -> dict[str, Any]:

@@ -299,7 +299,8 @@ def test_killing_the_live_service_repeatedly_does_not_affect_the_log(service: Ma
 @pytest.fixture
 def console(service: Machine) -> Iterator[str]:
     """Run with the console's service; return a command that prints the first snapshot that it feeds to a page."""
-    service.told("systemctl start swath-console", COMES_BACK_S)
+    failed = "{ journalctl --no-pager -b -u swath-console; exit 1; }"
+    service.told(f"systemctl start swath-console || {failed}", COMES_BACK_S)
     # the feed never ends: its first event is enough
     yield f"{{ curl -sN -m 60 {CONSOLE}/feed || true; }} | grep -m 1 ^data:"
     service.told("systemctl stop swath-console")

@@ -14,7 +14,6 @@ VERDICT = "verdict.json"
 VERSION = 1
 FLOWN, PREDICTED = "flown.npz", "calibration.json"
 PAGE, PRINTED = "landing.html", "landing.pdf"
-LIVE = "live"  # folder of live's files in the log directory
 MARK = "landing:"  # begins the text of the mark with which the operator writes the verdict into the log
 GOOD, REMARK, AGAIN, UNKNOWN, OPEN = "good", "remark", "again", "unknown", "open"  # states of a check
 HOME, FLY_AGAIN, WAIT = "home", "again", "wait"  # of the verdict

@@ -30,7 +30,7 @@ from swath.daemon.processing.live.lines import LINES, LiveLines
 from swath.daemon.processing.live.points import PointsFile
 from swath.daemon.processing.live.products import LiveProducts, Room
 from swath.daemon.processing.live.status import LiveStatus, sentence, write_status
-from swath.daemon.processing.live.tiles import Placement, replace_file
+from swath.daemon.processing.live.tiles import FOLDER, Placement, replace_file
 from swath.daemon.processing.live.unanswered import UnansweredPulses
 from swath.daemon.processing.pages.head import calibrations_words, crs_words
 from swath.daemon.processing.points.feed import LogFeed, Placed
@@ -41,7 +41,6 @@ from swath.georef.arrays import StructArray
 from swath.georef.georeference import Georeferencer
 from swath.georef.trajectory.trajectory import Trajectory
 
-FOLDER = "live"  # in the log directory
 POLL_S = 0.05
 STATUS_S = 1.0
 PRINT_WAIT_S = 8.0  # for the page at the end; the service has to end in time

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+FOLDER = "live"  # of all that live writes for other programs, in the log directory
 TILES, INDEX = "tiles", "index.json"
 SUFFIX = ".tile"
 VERSION = 1

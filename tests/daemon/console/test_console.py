@@ -85,6 +85,13 @@ def test_a_new_part_begins_when_asked(aircraft: Aircraft) -> None:
     wait_until(lambda: aircraft.asked.snapshot()["header"]["part"] == before + 1, "the next part")
 
 
+def test_the_console_loads_no_compiler(aircraft: Aircraft) -> None:
+    """Its unit forbids memory that is both written and executed, without which llvmlite does not start."""
+    mapped = {Path(one.path).name for one in aircraft.memory.memory_maps()}
+    assert any(name.startswith("_multiarray_umath") for name in mapped)
+    assert not any("llvmlite" in name for name in mapped)
+
+
 def test_every_page_has_the_headers_that_keep_others_code_out(aircraft: Aircraft) -> None:
     pages = ("/", "/pilot", "/landing", "/login")
     for path in (*pages, "/assets/console.js", "/assets/leaflet/leaflet.js", "/about", "/nothing"):
