@@ -12,6 +12,7 @@ from benchmarks import (
     georef,
     georef_log,
     listen,
+    live_extra,
     navigation,
     navigation_honesty,
     navigation_seeds,
@@ -31,3 +32,4 @@ planes.main()
 clock.main()
 acquire.main()
 listen.main()
+live_extra.main()

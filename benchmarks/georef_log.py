@@ -292,10 +292,15 @@ def fly(folder: Path, seconds: float, heads: list[str]) -> Path:
     """Make the log of a flight with these scanners in a new folder, and return the log's path."""
     folder.mkdir()
     (folder / "plan.toml").write_text(PLAN + "".join(heads))
-    swath = [sys.executable, "-c", "from swath.daemon.cli.main import main; main()"]
     arguments = ["sim", "fly", str(folder / "plan.toml"), "--seconds", f"{seconds:g}", "--no-truth"]
-    subprocess.run([*swath, *arguments, "-o", str(folder / "log")], check=True, stdout=subprocess.DEVNULL)
+    run_swath(*arguments, "-o", str(folder / "log"))
     return folder / "log"
+
+
+def run_swath(*arguments: str) -> None:
+    """Run a command of swath, without its output."""
+    swath = [sys.executable, "-c", "from swath.daemon.cli.main import main; main()"]
+    subprocess.run([*swath, *arguments], check=True, stdout=subprocess.DEVNULL)
 
 
 def main() -> None:

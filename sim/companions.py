@@ -27,6 +27,7 @@ from swath.sim.site import Site, geodetic_from_e
 
 FIRST_UDP_PORT = 2368
 FIRST_POSITION_PORT = 8308
+PLAN_NAME = "plan.toml"  # the configuration names it, so that live judges the lines by it
 README = """# A flight of the virtual aircraft: {name}
 
 `swath sim fly` made this flight from the plan in `plan.toml` with seed {seed}. It starts at {start}; GPS − UTC is
@@ -84,6 +85,7 @@ def config_text(plan: Plan, wires: dict[str, str], directory: str) -> str:
         "imu": {name: imu_config(table, name, wires[f"imu/{name}"]) for name, table in tables.imu.items()},
         "scanner": {name: _scanner_config(plan, name, wires) for name in tables.scanner},
         "atmosphere": tables.atmosphere.model_dump(exclude={"visibility_km"}),
+        "plan": {"file": PLAN_NAME},
         "profile": {"aircraft": "virtual", "installation": f"virtual/{tables.flight.name}"},
         "output": {"crs": tables.flight.crs},
     }
@@ -101,7 +103,7 @@ def companion_files(plan: Plan, site: Site, scene: Scene) -> dict[str, bytes]:
         files[f"{name}.nominal.toml"] = calibration_text(plan, name, true=False)
         files[f"{name}.true.toml"] = calibration_text(plan, name, true=True)
     files["control.csv"] = control_text(plan, control_points_e(plan, site, scene))
-    files["plan.toml"] = plan.text
+    files[PLAN_NAME] = plan.text
     files["README.md"] = _readme(plan)
     content = {name: text.encode() for name, text in files.items()}
     return content | {

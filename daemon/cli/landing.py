@@ -99,7 +99,7 @@ def _write(live: Path, found: dict[str, Any], page: Path, warnings: list[str], *
     """Write the page and its PDF; return what was written."""
     from swath.daemon.processing.earlier_runs import refuse_existing
     from swath.daemon.processing.landing.page import landing_page
-    from swath.daemon.processing.live.tiles import replace_file
+    from swath.daemon.processing.live.files import replace_file
     from swath.daemon.processing.pages.pdf import page_files
 
     refuse_existing([page], overwrite=overwrite, instead="name")

@@ -17,7 +17,7 @@ from swath.daemon.monitor.display import DEGRADED, NOT_RECORDING, RECORDING, Mon
 from swath.daemon.processing.landing.command import PREDICTED, VERDICT
 
 EVERY_S = 1.0
-STEERING_S = 0.2  # live writes it five times a second
+STEERING_S = 0.2  # live writes it twice a second, and a pilot should not wait
 HISTORY_S = 600
 EVENTS_KEPT = 500
 STALE_S = 5.0  # live writes its status each second

@@ -34,9 +34,12 @@ from swath.daemon.config.tables import Tables
 from swath.daemon.log.format import SessionInfo
 from swath.daemon.processing.compiling import compilations
 from swath.daemon.processing.live.frame import LocalFrame, Maps
-from swath.daemon.processing.live.grid import CellGrid, paint_points
+from swath.daemon.processing.live.grid import NO_STRIPS, CellGrid, paint_points
+from swath.daemon.processing.live.lines import warm_up_lines
+from swath.daemon.processing.live.look import LastLook
 from swath.daemon.processing.live.painting import LiveMap
 from swath.daemon.processing.live.products import Thinning
+from swath.daemon.processing.live.tiles import Head as TileHead
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.drivers.driver import find_driver
 from swath.drivers.parser import DeviceSettings, Parser
@@ -216,13 +219,23 @@ def warm_setup(setup: Setup) -> None:
 def _warm_frame(points: Points, trajectory: Trajectory | None, mapping: Maps | None) -> None:
     if trajectory is not None:
         frame = LocalFrame(trajectory.position_e[-1], mapping)
-        frame.cloud_of(points, Thinning(1000).keep(points.time_ns))
+        keep = Thinning(1000).keep(points.time_ns)
+        cloud = frame.cloud_of(points, keep)
         frame.pose_of(trajectory.position_e[-1], trajectory.q_e_from_b[-1])
         frame.placement()
         made = LiveMap(Path(), 1.0, 0, lambda host_ns: None)
         made.update(trajectory, 0)
         made.take(points, frame)
         made.end()
+        for place, pack in made.grid.take_changed():
+            pack(TileHead(*place, 1, 1.0, 1, 0.0, 0))
+        look = LastLook()
+        for at in (0, -1):
+            look.take_pose(int(trajectory.time_ns[at]), frame.of_e(trajectory.position_e[at : at + 1 or None])[0])
+        if len(keep):
+            look.take("line", points, keep, cloud)
+            look.profile(NO_STRIPS, made.comparison.heights)
+            warm_up_lines(points, trajectory, frame)
         trajectory.between(int(trajectory.time_ns[-1]), int(trajectory.time_ns[-1])).velocity_l()
         trajectory.poses(list(trajectory.span))
 

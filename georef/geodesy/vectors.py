@@ -70,6 +70,19 @@ def small_sine_cosine(square: float, angle: float) -> tuple[float, float]:
 
 
 @jit_inline
+def heading_and_roll(lat_rad: float, lon_rad: float, rot_e_from_b: Matrix) -> tuple[float, float]:
+    """Return heading, 0 … 2π, and roll, −π … π, of a body at a place (FORMULAS 1.4)."""
+    sin_lat, cos_lat, sin_lon, cos_lon = math.sin(lat_rad), math.cos(lat_rad), math.sin(lon_rad), math.cos(lon_rad)
+    north, east = (-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat), (-sin_lon, cos_lon, 0.0)
+    down = (-cos_lat * cos_lon, -cos_lat * sin_lon, -sin_lat)
+    nose = (rot_e_from_b[0][0], rot_e_from_b[1][0], rot_e_from_b[2][0])
+    right = (rot_e_from_b[0][1], rot_e_from_b[1][1], rot_e_from_b[2][1])
+    belly = (rot_e_from_b[0][2], rot_e_from_b[1][2], rot_e_from_b[2][2])
+    heading = math.atan2(dot(east, nose), dot(north, nose)) % (2.0 * math.pi)
+    return heading, math.atan2(dot(down, right), dot(down, belly))
+
+
+@jit_inline
 def sine_cosine(square: float, angle: float) -> tuple[float, float]:
     """Return sin(angle), cos(angle) of mostly small angles; ``square`` is the angle squared."""
     if square >= SMALL_ANGLE_2:

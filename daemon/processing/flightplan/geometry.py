@@ -12,41 +12,77 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
 from swath.daemon.processing.flightplan.plan import PlannedLine
-from swath.georef.arrays import BoolArray, FloatArray, Int64Array
+from swath.georef.arrays import FloatArray, Int64Array
+from swath.georef.compiled import jit_cached
 from swath.georef.geodesy.earth import (
+    A_M,
+    E2,
     e_from_geodetic,
     geodetic_from_e,
     meridian_radius_m,
     prime_vertical_radius_m,
     rot_e_from_l,
 )
+from swath.georef.geodesy.vectors import dot, vector_at
 
 LONGEST_SECTION_M = 50_000.0
 
 
+ALONG, ACROSS, AZIMUTH, DISTANCE, HEIGHT, ABOVE_GROUND = range(6)  # columns of `Places`
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Places:
-    """Places relative to lines; arrays (n, lines).
+    """Places relative to lines.
 
     Attributes:
-        along_m: from the line's begin; negative before it, beyond the length after its end.
-        across_m: positive to the right of the line's own direction.
-        azimuth_rad: of the line beside the place, clockwise from north, −π … π.
-        distance_m: to the nearest place of the line.
-        height_m: planned ellipsoidal height beside the place; nan: none.
-        above_ground_m: planned height above ground beside the place; nan: none.
+        columns: (6, n, lines) the values below.
     """
 
-    along_m: FloatArray
-    across_m: FloatArray
-    azimuth_rad: FloatArray
-    distance_m: FloatArray
-    height_m: FloatArray
-    above_ground_m: FloatArray
+    columns: FloatArray
+
+    @property
+    def along_m(self) -> FloatArray:
+        """From the line's begin (n, lines); negative before it, beyond the length after its end."""
+        return self._column(ALONG)
+
+    @property
+    def across_m(self) -> FloatArray:
+        """Distance to the line (n, lines), positive to the right of its own direction."""
+        return self._column(ACROSS)
+
+    @property
+    def azimuth_rad(self) -> FloatArray:
+        """Direction of the line (n, lines) beside the place, clockwise from north, −π … π."""
+        return self._column(AZIMUTH)
+
+    @property
+    def distance_m(self) -> FloatArray:
+        """Distance (n, lines) to the nearest place of the line."""
+        return self._column(DISTANCE)
+
+    @property
+    def height_m(self) -> FloatArray:
+        """Planned ellipsoidal height (n, lines) beside the place; nan: none."""
+        return self._column(HEIGHT)
+
+    @property
+    def above_ground_m(self) -> FloatArray:
+        """Planned height above ground (n, lines) beside the place; nan: none."""
+        return self._column(ABOVE_GROUND)
+
+    def _column(self, number: int) -> FloatArray:
+        column: FloatArray = self.columns[number]
+        return column
+
+    def last(self) -> Places:
+        """Return the last place relative to every line."""
+        return Places(self.columns[:, -1:])
 
 
 class LineGeometry:
@@ -61,97 +97,93 @@ class LineGeometry:
         count = [len(one) - 1 for one in sections]
         ends = np.concatenate([np.empty((0, 5)), *(one[:-1] for one in sections)])
         others = np.concatenate([np.empty((0, 5)), *(one[1:] for one in sections)])
-        self._first: Int64Array = np.cumsum([0, *count], dtype=np.int64)[:-1]
-        is_first, is_last = np.zeros(len(ends), np.bool_), np.zeros(len(ends), np.bool_)
-        if len(ends):
-            is_first[self._first], is_last[self._first + np.array(count) - 1] = True, True
-        self._is_first, self._is_last = is_first, is_last
+        self._first: Int64Array = np.cumsum([0, *count], dtype=np.int64)
         self._lay(ends, others)
-        sizes = np.add.reduceat(self._size_m, self._first) if len(ends) else np.empty(0)
-        self.length_m: FloatArray = sizes
-        begin = np.concatenate([[0.0], np.cumsum(self._size_m)])[:-1]
-        self._begin_m: FloatArray = begin - np.repeat(begin[self._first], count) if len(ends) else begin
-        self._heights = ends[:, 3:], others[:, 3:]
+        size_m = self._sizes[:, 3]
+        begin = np.concatenate([[0.0], np.cumsum(size_m)])
+        self.length_m: FloatArray = np.diff(begin[self._first])
+        self._sizes[:, 4] = begin[:-1] - np.repeat(begin[self._first[:-1]], count)
+        self._heights = np.stack([ends[:, 3:], others[:, 3:]], axis=1)
 
     def _lay(self, ends: FloatArray, others: FloatArray) -> None:
-        """Lay a frame in the middle of each section: along, right, up, and its radii of curvature."""
+        """Lay a frame in the middle of each section, and measure it.
+
+        ``_frames`` (sections, 4, 3) has origin, along, right, up; ``_sizes`` (sections, 5) the radii of curvature along
+        and across, half of the length, the length, and the way along the line to the section's begin.
+        """
         one, other = ends[:, :3], others[:, :3]
         lat, lon, _ = geodetic_from_e((one + other) / 2.0)
-        self._origin_e = e_from_geodetic(lat, lon, np.zeros_like(lat))
+        origin_e = e_from_geodetic(lat, lon, np.zeros_like(lat))
         rot = rot_e_from_l(lat, lon)
         north, east, up = rot[..., 0], rot[..., 1], -rot[..., 2]
         chord = other - one
         along = chord - _dot(chord, up)[:, np.newaxis] * up
         along /= np.linalg.norm(along, axis=-1, keepdims=True)
-        self._along, self._right, self._up = along, np.cross(along, up), up
         cos2, sin2 = _dot(along, north) ** 2, _dot(along, east) ** 2
         meridian, vertical = meridian_radius_m(lat), prime_vertical_radius_m(lat)
-        self._radius_m = 1.0 / (cos2 / meridian + sin2 / vertical)
-        self._radius_across_m = 1.0 / (sin2 / meridian + cos2 / vertical)
-        self._half_m = -self._arcs(one - self._origin_e)[0]
-        self._size_m = self._half_m + self._arcs(other - self._origin_e)[0]
+        radius_m, radius_across_m = 1.0 / (cos2 / meridian + sin2 / vertical), 1.0 / (sin2 / meridian + cos2 / vertical)
 
-    def _arcs(self, away_e: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return along and across from the middle, and the angle along, of vectors (…, sections, 3)."""
-        angle = np.arctan2(_dot(away_e, self._along), self._radius_m + _dot(away_e, self._up))
-        share = np.clip(_dot(away_e, self._right) / self._radius_across_m, -1.0, 1.0)
-        return self._radius_m * angle, self._radius_across_m * np.arcsin(share), angle
+        def arc(place_e: FloatArray) -> FloatArray:
+            away_e = place_e - origin_e
+            length: FloatArray = radius_m * np.arctan2(_dot(away_e, along), radius_m + _dot(away_e, up))
+            return length
+
+        half_m = -arc(one)
+        self._frames = np.stack([origin_e, along, np.cross(along, up), up], axis=1)
+        self._sizes = np.stack([radius_m, radius_across_m, half_m, half_m + arc(other), np.zeros_like(half_m)], axis=1)
 
     def places(self, lat_rad: FloatArray, lon_rad: FloatArray) -> Places:
         """Return where positions (n,) are relative to every line."""
-        lat, lon = np.atleast_1d(lat_rad), np.atleast_1d(lon_rad)
-        count = len(self._first)
-        if not count or not len(lat):
-            return Places(*(np.empty((len(lat), count)) for _ in range(6)))
-        flat_e = e_from_geodetic(lat, lon, np.zeros_like(lat))
-        middle, across, angle = self._arcs(flat_e[:, np.newaxis, :] - self._origin_e)
-        along = middle + self._half_m
-        inside = np.clip(along, 0.0, self._size_m)
-        distance = np.hypot(along - inside, across)
-        best = _least(distance, self._first)
-        free = np.where(self._is_last, np.maximum(inside, along), inside)
-        free = np.where(self._is_first, np.minimum(free, along), free)
-        rows = np.arange(len(lat))[:, np.newaxis]
-        heights = [self._planned(kind, inside)[rows, best] for kind in (0, 1)]
-        azimuth = self._azimuth(lat, lon, angle, best)
-        return Places(
-            (free + self._begin_m)[rows, best],
-            across[rows, best],
-            azimuth,
-            distance[rows, best],
-            heights[0],
-            heights[1],
-        )
+        lat, lon = (np.ascontiguousarray(np.atleast_1d(angle), np.float64) for angle in (lat_rad, lon_rad))
+        found = np.empty((6, len(lat), len(self.length_m)))
+        if found.size:
+            _place(lat, lon, self._first, self._frames, self._sizes, self._heights, found)
+        return Places(found)
 
-    def _planned(self, kind: int, inside_m: FloatArray) -> FloatArray:
-        one, other = self._heights[0][:, kind], self._heights[1][:, kind]
-        planned: FloatArray = one + (other - one) * (inside_m / self._size_m)
-        return planned
 
-    def _azimuth(self, lat: FloatArray, lon: FloatArray, angle: FloatArray, best: Int64Array) -> FloatArray:
-        """Return the direction (n, lines) of the nearest section at the foot of the perpendicular."""
-        rows = np.arange(len(lat))[:, np.newaxis]
-        turned = angle[rows, best][..., np.newaxis]
-        forward = np.cos(turned) * self._along[best] - np.sin(turned) * self._up[best]
-        rot = rot_e_from_l(lat, lon)
-        north, east = rot[:, np.newaxis, :, 0], rot[:, np.newaxis, :, 1]
-        azimuth: FloatArray = np.arctan2(_dot(forward, east), _dot(forward, north))
-        return azimuth
+@jit_cached
+def _place(lat: Any, lon: Any, first: Any, frames: Any, sizes: Any, heights: Any, found: Any) -> None:
+    """Fill ``found`` (6, n, lines) with the columns of `Places`, of the nearest section of each line; nan: no place."""
+    for i in range(len(lat)):
+        sin_lat, cos_lat, sin_lon, cos_lon = math.sin(lat[i]), math.cos(lat[i]), math.sin(lon[i]), math.cos(lon[i])
+        normal_m = A_M / math.sqrt(1.0 - E2 * sin_lat**2)
+        x_e, y_e = normal_m * cos_lat * cos_lon, normal_m * cos_lat * sin_lon
+        z_e = (1.0 - E2) * normal_m * sin_lat
+        for line in range(len(first) - 1):
+            least = math.inf
+            found[:, i, line] = math.nan
+            for at in range(first[line], first[line + 1]):
+                frame, size = frames[at], sizes[at]
+                away = x_e - frame[0, 0], y_e - frame[0, 1], z_e - frame[0, 2]
+                angle = math.atan2(dot(away, vector_at(frame, 1)), size[0] + dot(away, vector_at(frame, 3)))
+                share = min(max(dot(away, vector_at(frame, 2)) / size[1], -1.0), 1.0)
+                along, across = size[0] * angle + size[2], size[1] * math.asin(share)
+                inside = min(max(along, 0.0), size[3])
+                distance = math.hypot(along - inside, across)
+                if not distance < least:
+                    continue
+                least = distance
+                free = inside
+                if at == first[line + 1] - 1:
+                    free = max(free, along)
+                if at == first[line]:
+                    free = min(free, along)
+                cos, sin = math.cos(angle), math.sin(angle)
+                fx = cos * frame[1, 0] - sin * frame[3, 0]
+                fy = cos * frame[1, 1] - sin * frame[3, 1]
+                fz = cos * frame[1, 2] - sin * frame[3, 2]
+                found[ALONG, i, line], found[ACROSS, i, line] = free + size[4], across
+                found[DISTANCE, i, line] = distance
+                north = cos_lat * fz - sin_lat * (cos_lon * fx + sin_lon * fy)
+                found[AZIMUTH, i, line] = math.atan2(cos_lon * fy - sin_lon * fx, north)
+                for kind in range(2):
+                    one, other = heights[at, 0, kind], heights[at, 1, kind]
+                    found[HEIGHT + kind, i, line] = one + (other - one) * (inside / size[3])
 
 
 def _dot(one: FloatArray, other: FloatArray) -> FloatArray:
     product: FloatArray = np.sum(one * other, axis=-1)
     return product
-
-
-def _least(values: FloatArray, first: Int64Array) -> Int64Array:
-    """Return for each row and group of columns, which begin at ``first``, the column of the least value."""
-    least = np.minimum.reduceat(values, first, axis=1)
-    sizes = np.diff(np.append(first, values.shape[1]))
-    is_least: BoolArray = values == np.repeat(least, sizes, axis=1)
-    columns = np.where(is_least, np.arange(values.shape[1]), values.shape[1])
-    found: Int64Array = np.minimum.reduceat(columns, first, axis=1)
-    return found
 
 
 def _sections(line: PlannedLine) -> FloatArray:

@@ -230,8 +230,10 @@ def _lasting(mask: BoolArray, least_s: float, edge_s: float) -> BoolArray:
 
     Pauses shorter than `BRIDGE_S` do not end a run.
     """
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     found = np.zeros(len(mask), np.bool_)
+    if not mask.any():
+        return found
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     joined: list[list[int]] = []
     for start, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         if joined and (start - joined[-1][1]) * STEP_S < BRIDGE_S:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from swath.daemon.processing.flightplan.judge import Judged, Limits, LineVerdict, Reason, judge, judge_line
-from swath.daemon.processing.flightplan.moments import empty_moments
+from swath.daemon.processing.flightplan.moments import empty_moments, join_moments
 from swath.georef.arrays import StructArray
 from swath.georef.timescales.gps_time import SECOND_NS
 
@@ -50,7 +50,7 @@ class Pass:
     def moments(self) -> StructArray:
         """Return its moments in one array."""
         if len(self.rows) > 1:
-            self.rows = [np.concatenate(self.rows)]
+            self.rows = [join_moments(self.rows)]
         return self.rows[0] if self.rows else empty_moments(0)
 
 
@@ -67,12 +67,22 @@ class Line:
     overlap: Reason | None = None
     judged: dict[int, Judged] = field(default_factory=dict)  # by the pass's number
     is_new: bool = True  # moments or passes came since the last verdict
+    told: dict[str, Any] | None = None  # by `plain_line`, until something changes
+
+    def take_word(self, overrule: Overrule | None) -> None:
+        """Take the operator's word on the line; None takes it back."""
+        self.overrule, self.told = overrule, None
+
+    def take_overlap(self, reason: Reason | None) -> None:
+        """Take the reason why the overlap with its neighbours is too small; None: it is not."""
+        if reason != self.overlap:
+            self.overlap, self.told = reason, None
 
     def refresh(self) -> None:
         """Judge the passes anew if something came."""
         if not self.is_new:
             return
-        self.is_new = False
+        self.is_new, self.told = False, None
         counted = []
         for one in self.passes:
             rows = one.moments()
@@ -112,7 +122,13 @@ class Line:
 
 
 def plain_line(line: Line, *, is_flying: bool) -> dict[str, Any]:
-    """Return the state of a line as plain values."""
+    """Return the state of a line as plain values, which are not to be changed."""
+    if line.told is None:
+        line.told = _plain(line)
+    return line.told | {"state": "flying"} if is_flying else line.told
+
+
+def _plain(line: Line) -> dict[str, Any]:
     verdict = line.verdict
     flown = np.empty(0, np.bool_) if verdict is None else verdict.flown
     times = [int(one.rows["gps_ns"][place]) for one in line.judged.values() for place in (0, -1)]
@@ -121,7 +137,7 @@ def plain_line(line: Line, *, is_flying: bool) -> dict[str, Any]:
     overrule = line.overrule
     return {
         "name": line.name,
-        "state": "flying" if is_flying else line.state,
+        "state": line.state,
         "reasons": [reason.plain() for reason in line.reasons],
         "begin_gps_ns": min(times) if times else None,
         "end_gps_ns": max(times) if times else None,

@@ -7,8 +7,10 @@ together and gives each moment once, when its returns are complete.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -47,6 +49,9 @@ MOMENT_DTYPE = np.dtype(
     ]
 )
 
+_RAW = np.dtype((np.void, MOMENT_DTYPE.itemsize))  # NumPy copies rows as such without going through their columns
+_OF_RETURNS = ("returns", "pulses", "silent", "empty", "untimed", "left_m", "right_m", "above_m")
+
 
 def empty_moments(count: int) -> StructArray:
     """Return rows of `MOMENT_DTYPE` with nothing known."""
@@ -56,6 +61,13 @@ def empty_moments(count: int) -> StructArray:
     for name in ("planned_m", "planned_above_m", "left_m", "right_m", "above_m"):
         rows[name] = math.nan
     return rows
+
+
+def join_moments(blocks: Sequence[StructArray]) -> StructArray:
+    """Return blocks of `MOMENT_DTYPE` as one array."""
+    if len(blocks) == 1:
+        return blocks[0]
+    return np.concatenate([empty_moments(0).view(_RAW), *(block.view(_RAW) for block in blocks)]).view(MOMENT_DTYPE)
 
 
 @dataclass(slots=True)
@@ -86,7 +98,7 @@ class Moments:
 
     def __init__(self, scanners: Sequence[str]) -> None:
         self._scanners = list(scanners)
-        self._poses: list[StructArray] = []
+        self._poses: deque[StructArray] = deque()
         self._returns: dict[int, dict[str, Returns]] = {}
         self._newest_ns = -(1 << 62)
         self._tells: set[str] = set()  # scanners that tell pulses without a return
@@ -101,53 +113,72 @@ class Moments:
         """Return the record of a scanner's returns at a time, to add to it."""
         return self._returns.setdefault(gps_ns // STEP_NS, {}).setdefault(scanner, Returns())
 
-    def add_seen(self, gps_ns: int, scanner: str, returns: int, empty: int) -> None:
-        """Take numbers of returns, and of pulses known to have none, that came in the two moments up to this time."""
+    def add_seen(self, gps_ns: Sequence[int], scanner: str, returns: int, empty: int) -> None:
+        """Take numbers of returns, and of pulses known to have none, that came while these moments passed."""
         if empty:
             self._tells.add(scanner)
-        for at_ns, share in ((gps_ns, 0), (gps_ns - STEP_NS, 1)):
+        count = len(gps_ns)
+        for place, at_ns in enumerate(gps_ns):
             record = self.returns_at(at_ns, scanner)
-            record.seen += (returns + share) // 2
-            record.empty += (empty + share) // 2
+            record.seen += (returns + place) // count
+            record.empty += (empty + place) // count
 
     def settled(self, *, last: bool = False) -> StructArray:
         """Return the moments (n,) whose returns are complete; ``last``: all that are left."""
-        if not self._poses:
-            return empty_moments(0)
-        poses = np.concatenate(self._poses) if len(self._poses) > 1 else self._poses[0]
         until_ns = self._newest_ns + (1 if last else -SETTLE_NS)
-        count = int(np.searchsorted(poses["gps_ns"], until_ns))
-        rows, self._poses = poses[:count].copy(), [poses[count:]] if count < len(poses) else []
-        if not count:
-            return rows
-        for row in rows:
-            self._fill(row)
-        before = int(rows["gps_ns"][-1]) // STEP_NS - 20  # pulses without a return are placed to a second or two
+        found = []
+        while self._poses and int(self._poses[0]["gps_ns"][0]) < until_ns:
+            block = self._poses.popleft()
+            count = int(np.searchsorted(block["gps_ns"], until_ns))
+            found.append(block[:count])
+            if count < len(block):
+                self._poses.appendleft(block[count:])
+        if not found:
+            return empty_moments(0)
+        rows = join_moments(found).copy()
+        keys = (rows["gps_ns"] // STEP_NS).tolist()
+        for name, values in self._facts(keys).items():
+            rows[name] = values
+        before = keys[-1] - 20  # pulses without a return are placed to a second or two
         for key in [key for key in self._returns if key < before]:
             del self._returns[key]
         return rows
 
-    def _fill(self, row: StructArray) -> None:
-        key = int(row["gps_ns"]) // STEP_NS
+    def _facts(self, keys: list[int]) -> dict[str, list[Any]]:
+        """Return the columns of `MOMENT_DTYPE` that tell of the scanners, for moments by their number."""
+        found: dict[str, list[Any]] = {name: [] for name in _OF_RETURNS}
+        for key in keys:
+            for name, value in zip(_OF_RETURNS, self._fact(key), strict=True):
+                found[name].append(value)
+        return found
+
+    def _fact(self, key: int) -> tuple[float, ...]:
+        """Return the values of one moment, in the order of `_OF_RETURNS`."""
         found = self._returns.get(key, {})
-        pulses = 0
+        returns = pulses = silent = empty = untimed = 0
+        left_m = right_m = above_m = math.nan
         for scanner in self._scanners:
-            one = found.get(scanner, Returns())
-            row["returns"] += one.first
+            one = found.get(scanner) or Returns()
+            returns += one.first
             pulses += one.first + one.empty
-            for name, choose in (("left_m", min), ("right_m", max)):
-                value = getattr(one, name)
-                if not math.isnan(value):
-                    row[name] = value if math.isnan(row[name]) else choose(float(row[name]), value)
-            if math.isnan(row["above_m"]):
-                row["above_m"] = one.above_m
+            if not math.isnan(one.left_m):
+                left_m = one.left_m if math.isnan(left_m) else min(left_m, one.left_m)
+            if not math.isnan(one.right_m):
+                right_m = one.right_m if math.isnan(right_m) else max(right_m, one.right_m)
+            if math.isnan(above_m):
+                above_m = one.above_m
             if one.first == 0:
                 emits = scanner in self._tells and self._is_near(key, scanner, "empty")
-                is_seen = self._is_near(key, scanner, "seen")
-                row["empty" if emits else "untimed" if is_seen else "silent"] += 1
-        row["pulses"] = pulses if self._tells.issuperset(self._scanners) and self._scanners else -1
+                is_seen = not emits and self._is_near(key, scanner, "seen")
+                empty, untimed, silent = empty + emits, untimed + is_seen, silent + (not emits and not is_seen)
+        if not self._scanners or not self._tells.issuperset(self._scanners):
+            pulses = -1
+        return returns, pulses, silent, empty, untimed, left_m, right_m, above_m
 
     def _is_near(self, key: int, scanner: str, name: str) -> bool:
         """Return whether something came within half a second: it is placed by the log's time, which is inexact."""
-        near = (self._returns.get(key + step, {}).get(scanner) for step in range(-5, 6))
-        return any(one is not None and getattr(one, name) > 0 for one in near)
+        for near in range(key - 5, key + 6):
+            one = self._returns.get(near, {}).get(scanner)
+            if one is not None and getattr(one, name) > 0:
+                return True
+        return False

@@ -50,10 +50,10 @@ def overlap_reasons(
     """
     wanted = (config.wanted.overlap_percent or 0.0) / 100.0
     due_m = DUE_SHARE * config.tolerance.cross_track_m
-    for line in lines:
-        line.overlap = None
     for one, line in enumerate(lines):
+        worst: Reason | None = None
         if line.verdict is None:
+            line.take_overlap(None)
             continue
         for side in (-1, 1):
             found = _beside(geometry, planned, lines, one, side)
@@ -64,28 +64,34 @@ def overlap_reasons(
             theirs = np.maximum(beside.other_outward_m, 0.0) > np.maximum(beside.outward_m, 0.0)
             is_due = np.maximum(beside.outward_m, beside.other_outward_m) > due_m
             blamed = np.where(is_due, ~theirs, _is_later(line, lines[other]))
-            _note(line, lines[other].name, beside, lacks & blamed, wanted)
+            worst = _worse(worst, _lack(line, lines[other].name, beside, lacks & blamed, wanted))
+        line.take_overlap(worst)
 
 
 def _is_later(line: Line, other: Line) -> bool:
     return max(one.begin_ns for one in line.passes) > max(one.begin_ns for one in other.passes)
 
 
-def _note(line: Line, other: str, beside: _Side, mask: BoolArray, wanted: float) -> None:
+def _worse(one: Reason | None, other: Reason | None) -> Reason | None:
+    if one is None or other is None:
+        return one if other is None else other
+    return other if (other.is_grave, -other.value) > (one.is_grave, -one.value) else one
+
+
+def _lack(line: Line, other: str, beside: _Side, mask: BoolArray, wanted: float) -> Reason | None:
+    """Return the reason for the masked cells; None: they are too few."""
     assert line.verdict is not None
     cell_m = line.verdict.cell_m
     size_m = float(mask.sum()) * cell_m
     if size_m < LEAST_M:
-        return
+        return None
     least = float(beside.overlap[mask].min())
     is_grave = float((mask & (beside.overlap < wanted / 2.0)).sum()) * cell_m >= LEAST_M
     places = beside.cells[mask]
     what = f"overlap {100 * least:.0f} % with line {other}" if least >= 0.0 else f"gap to line {other}"
     from_m, to_m = float(places.min()) * cell_m, float(places.max() + 1) * cell_m
     text = f"{what}, below {100 * wanted:g} % on {size_m:.0f} m, {from_m:.0f} to {to_m:.0f} m"
-    reason = Reason("overlap", is_grave, text, 100 * least, 100 * wanted, from_m, to_m)
-    if line.overlap is None or (reason.is_grave, -reason.value) > (line.overlap.is_grave, -line.overlap.value):
-        line.overlap = reason
+    return Reason("overlap", is_grave, text, 100 * least, 100 * wanted, from_m, to_m)
 
 
 def _beside(

@@ -10,7 +10,7 @@ import numpy as np
 from swath.daemon.config.tables import PlanConfig
 from swath.daemon.processing.flightplan.judge import Limits
 from swath.daemon.processing.flightplan.lines import Line, Overrule, Pass, parsed_overrule, plain_line
-from swath.daemon.processing.flightplan.moments import empty_moments
+from swath.daemon.processing.flightplan.moments import empty_moments, join_moments
 from swath.daemon.processing.flightplan.watch import mark_fixes
 from swath.georef.arrays import FloatArray, StructArray
 from swath.georef.strips import Span, StripRules, straight_spans
@@ -35,7 +35,7 @@ class StripWatch:
         self._config = config
         self._rules = StripRules()
         self._limits = Limits.of(config)
-        self._rows = empty_moments(0)
+        self._rows, self._new = empty_moments(0), list[StructArray]()
         self._closed_ns = self._looked_ns = -(1 << 62)
         self._is_flying = False
         self._best_fix = 0
@@ -52,7 +52,7 @@ class StripWatch:
         """Take moments (n,) whose returns are complete, in the order of time."""
         if not len(rows):
             return
-        self._rows = np.concatenate([self._rows, rows])
+        self._new.append(rows)
         newest_ns = int(rows["gps_ns"][-1])
         if newest_ns - self._looked_ns >= LOOK_NS:
             self._looked_ns = newest_ns
@@ -60,6 +60,8 @@ class StripWatch:
 
     def _look(self, newest_ns: int) -> None:
         """Find the strips that have ended, and the one that is being flown."""
+        self._rows = join_moments([self._rows, *self._new])
+        self._new.clear()
         rows, rules = self._rows, self._rules
         settled_ns = newest_ns - round((rules.window_s / 2 + rules.min_turn_s) * SECOND_NS)
         if self._is_flying:
@@ -111,7 +113,7 @@ class StripWatch:
         if line is None:
             return False
         overrule = Overrule(verdict, note, time_ns) if verdict else None
-        self.lines[line].overrule = overrule
+        self.lines[line].take_word(overrule)
         self._overrules.pop(self.lines[line].name, None)
         if overrule is not None:
             self._overrules[self.lines[line].name] = overrule
@@ -119,8 +121,9 @@ class StripWatch:
 
     def close(self) -> None:
         """End the strip that is being flown: no more moments come."""
-        if len(self._rows):
-            self._look(int(self._rows["gps_ns"][-1]))
+        rows = join_moments([self._rows, *self._new])
+        if len(rows):
+            self._look(int(rows["gps_ns"][-1]))
         self._is_flying = False
 
     def plain(self) -> dict[str, Any]:

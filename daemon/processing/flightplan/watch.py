@@ -6,20 +6,29 @@ All decisions depend on the poses and moments that come in, never on a clock, so
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from swath.daemon.config.tables import PlanConfig
-from swath.daemon.processing.flightplan.geometry import LineGeometry, Places
+from swath.daemon.processing.flightplan.geometry import (
+    ABOVE_GROUND,
+    ACROSS,
+    ALONG,
+    AZIMUTH,
+    HEIGHT,
+    LineGeometry,
+    Places,
+)
 from swath.daemon.processing.flightplan.judge import Limits
 from swath.daemon.processing.flightplan.lines import Line, Overrule, Pass, parsed_overrule, plain_line
 from swath.daemon.processing.flightplan.moments import SETTLE_NS
 from swath.daemon.processing.flightplan.overlap import overlap_reasons
 from swath.daemon.processing.flightplan.plan import FlightPlan
 from swath.georef.arrays import BoolArray, FloatArray, StructArray
+from swath.georef.compiled import jit_cached, jit_inline
 from swath.georef.timescales.gps_time import SECOND_NS
 
 ALIGNED_RAD, STILL_ALIGNED_RAD = math.radians(20.0), math.radians(35.0)  # between track and line
@@ -76,9 +85,68 @@ class Steering:
         return {"line": self.line, "reverse": self.is_reverse, **told}
 
 
+@jit_cached
+def _approach(columns: Any, length_m: Any, left: Any, track_rad: float) -> tuple[int, bool]:
+    """Return the nearest line ahead of a place that is ``left`` (lines,), and if against its direction; −1: none is."""
+    least, best, is_reverse = math.inf, -1, False
+    for line in range(len(length_m)):
+        along, across = columns[ALONG, 0, line], abs(columns[ACROSS, 0, line])
+        off = abs(_turned_inside(track_rad - columns[AZIMUTH, 0, line]))
+        ahead = -1.0
+        if off <= APPROACH_RAD:
+            ahead = -along
+        elif off >= math.pi - APPROACH_RAD:
+            ahead = along - length_m[line]
+        if left[line] and 0.0 <= ahead <= APPROACH_M and across <= APPROACH_ACROSS_M:
+            distance = math.hypot(ahead, across)
+            if distance < least:
+                least, best, is_reverse = distance, line, off >= math.pi - APPROACH_RAD
+    return best, is_reverse
+
+
+@jit_cached
+def _note(rows: Any, place: int, number: int, line: int, columns: Any) -> None:
+    """Note in a pose the pass and the line that it is flown on; ``columns`` are those of `Places`."""
+    row = rows[place]
+    row.run, row.along_m, row.across_m = number, columns[ALONG, place, line], columns[ACROSS, place, line]
+    row.planned_m, row.planned_above_m = columns[HEIGHT, place, line], columns[ABOVE_GROUND, place, line]
+
+
 def _turned(angle_rad: Any) -> Any:
     """Return angles as −π … π."""
     return (angle_rad + math.pi) % (2.0 * math.pi) - math.pi
+
+
+_turned_inside = jit_inline(_turned)
+
+
+@jit_cached
+def _fit(columns: Any, length_m: Any, rows: Any, reach_m: float, off: Any, cost: Any, keeps: Any, best: Any) -> None:
+    """Compare poses with every line.
+
+    Args:
+        columns: (6, n, lines) of `Places`.
+        length_m: (lines,).
+        rows: the poses (n,).
+        reach_m: how far beside a line it still counts as flown.
+        off, cost: (n, lines) angle between track and line, and how badly the line is flown.
+        keeps: (n, lines) whether a pass goes on.
+        best: (n,) the line that is flown best; −1: none is.
+    """
+    along_m, across_m, azimuth_rad, planned_m = columns[ALONG], columns[ACROSS], columns[AZIMUTH], columns[HEIGHT]
+    for i in range(len(rows)):
+        track, speed, height = rows[i].track_rad, rows[i].speed_mps, rows[i].height_m
+        least, best[i] = math.inf, -1
+        for k in range(len(length_m)):
+            turned = _turned_inside(track - azimuth_rad[i, k])
+            away, across, above = abs(turned), abs(across_m[i, k]), abs(height - planned_m[i, k])
+            angle = min(away, math.pi - away)
+            inside = 0.0 <= along_m[i, k] <= length_m[k] and speed >= SLOWEST_MPS
+            off[i, k] = turned
+            keeps[i, k] = inside and angle <= STILL_ALIGNED_RAD and across <= 1.5 * reach_m
+            cost[i, k] = across + (0.0 if math.isnan(above) else above) + (REVERSE_M if away > math.pi / 2 else 0.0)
+            if inside and angle <= ALIGNED_RAD and across <= reach_m and cost[i, k] < least:
+                least, best[i] = cost[i, k], k
 
 
 class LineWatch:
@@ -107,6 +175,8 @@ class LineWatch:
         self._count = 0
         self._best_fix = 0
         self._last_line: int | None = None
+        self._due_lines: BoolArray | None = None
+        self._geometry = self._drawn()
         self._reach_m = max(REACH_TOLERANCES * config.tolerance.cross_track_m, LEAST_REACH_M)
 
     # ------------------------------------------------------------------ poses
@@ -118,30 +188,14 @@ class LineWatch:
             return rows
         self._best_fix = mark_fixes(rows, self._config, self._best_fix)
         places = self.geometry.places(rows["lat_rad"], rows["lon_rad"])
-        off = _turned(rows["track_rad"][:, np.newaxis] - places.azimuth_rad)
-        inside = (places.along_m >= 0.0) & (places.along_m <= self.geometry.length_m)
-        inside &= rows["speed_mps"][:, np.newaxis] >= SLOWEST_MPS
-        across = np.abs(places.across_m)
-        on = self._on(off, inside, across, ALIGNED_RAD, self._reach_m)
-        keeps = self._on(off, inside, across, STILL_ALIGNED_RAD, 1.5 * self._reach_m)
-        above: FloatArray = np.abs(rows["height_m"][:, np.newaxis] - places.height_m)
-        cost = across + np.where(np.isnan(above), 0.0, above) + REVERSE_M * (np.abs(off) > math.pi / 2)
-        least = np.argmin(np.where(on, cost, np.inf), axis=1)
-        any_on: BoolArray = np.logical_or.reduce(on, axis=1)
-        for place in range(len(rows)):
-            best = int(least[place]) if any_on[place] else None
-            self._choose(int(rows["gps_ns"][place]), off[place], keeps[place], cost[place], best)
+        off, cost = np.empty((2, len(rows), len(self.lines)))
+        keeps, best = np.empty(off.shape, np.bool_), np.empty(len(rows), np.int64)
+        _fit(places.columns, self.geometry.length_m, rows, self._reach_m, off, cost, keeps, best)
+        for place, (gps_ns, line) in enumerate(zip(rows["gps_ns"].tolist(), best.tolist(), strict=True)):
+            self._choose(gps_ns, off[place], keeps[place], cost[place], line if line >= 0 else None)
             if self.current is not None:
-                line = self.current.line
-                rows["run"][place], rows["along_m"][place] = self.current.number, places.along_m[place, line]
-                rows["across_m"][place], rows["planned_m"][place] = (
-                    places.across_m[place, line],
-                    places.height_m[place, line],
-                )
-                rows["planned_above_m"][place] = places.above_ground_m[place, line]
-        last = len(rows) - 1
-        newest = Places(*(getattr(places, one.name)[last:] for one in fields(Places)))
-        self.steering = self._steer(rows[last:], newest)
+                _note(rows, place, self.current.number, self.current.line, places.columns)
+        self.steering = self._steer(rows[-1:], places.last())
         return rows
 
     def _choose(self, gps_ns: int, off: FloatArray, keeps: BoolArray, cost: FloatArray, best: int | None) -> None:
@@ -177,13 +231,8 @@ class LineWatch:
         flown.passes.append(self.current)
         flown.is_new = True
         if flown.overrule is not None and flown.overrule.verdict == "again":
-            flown.overrule = None  # it is being done
-
-    @staticmethod
-    def _on(off: FloatArray, inside: BoolArray, across: FloatArray, aligned_rad: float, reach_m: float) -> BoolArray:
-        angle = np.minimum(np.abs(off), math.pi - np.abs(off))
-        found: BoolArray = inside & (angle <= aligned_rad) & (across <= reach_m)
-        return found
+            flown.take_word(None)  # it is being done
+            self._due_lines = None
 
     # ------------------------------------------------------------------ steering
 
@@ -219,19 +268,14 @@ class LineWatch:
 
     def _approached(self, places: Places, track_rad: float) -> tuple[int, bool] | None:
         """Return the line to be flown next, and its direction: one ahead, or the next of the plan."""
-        left = np.array([line.state in ("planned", "again") for line in self.lines])
+        left = self._due()
         if not left.any():
             return None
-        length = self.geometry.length_m
-        along, across = places.along_m[0], np.abs(places.across_m[0])
-        off = np.abs(_turned(track_rad - places.azimuth_rad[0]))
-        ahead_m = np.where(off <= APPROACH_RAD, -along, np.where(off >= math.pi - APPROACH_RAD, along - length, -1.0))
-        ahead = left & (ahead_m >= 0.0) & (ahead_m <= APPROACH_M) & (across <= APPROACH_ACROSS_M)
-        if ahead.any():
-            line = int(np.argmin(np.where(ahead, np.hypot(ahead_m, across), np.inf)))
-            return line, bool(off[line] >= math.pi - APPROACH_RAD)
+        line, is_reverse = _approach(places.columns, self.geometry.length_m, left, track_rad)
+        if line >= 0:
+            return line, is_reverse
         line = self._following(left, self._last_line)
-        return line, bool(along[line] > length[line] / 2.0)
+        return line, bool(places.along_m[0, line] > self.geometry.length_m[line] / 2.0)
 
     @staticmethod
     def _following(left: BoolArray, last: int | None) -> int:
@@ -240,15 +284,21 @@ class LineWatch:
         order = [*range(start, len(left)), *range(min(start, len(left)))]
         return int(next(line for line in order if left[line]))
 
+    def _due(self) -> BoolArray:
+        """Return which lines have to be flown (lines,), as known since the last change."""
+        if self._due_lines is None:
+            self._due_lines = np.array([line.state in ("planned", "again") for line in self.lines])
+        return self._due_lines
+
     @property
     def next_line(self) -> str | None:
         """Name of the line to be flown after the present one; None: none is left."""
         if self.current is None and self.steering is not None:
             return self.steering.line
-        left = np.array([line.state in ("planned", "again") for line in self.lines])
-        last = self._last_line
+        left, last = self._due(), self._last_line
         if self.current is not None:
-            left[self.current.line], last = False, self.current.line
+            left, last = left.copy(), self.current.line
+            left[last] = False
         return self.lines[self._following(left, last)].name if left.any() else None
 
     # ------------------------------------------------------------------ moments
@@ -283,7 +333,8 @@ class LineWatch:
         line, verdict, note = parsed_overrule(text, [line.name for line in self.lines])
         if line is None:
             return False
-        self.lines[line].overrule = Overrule(verdict, note, time_ns) if verdict else None
+        self.lines[line].take_word(Overrule(verdict, note, time_ns) if verdict else None)
+        self._due_lines = None
         return True
 
     # ------------------------------------------------------------------ result
@@ -291,6 +342,8 @@ class LineWatch:
     def refresh(self) -> None:
         """Judge all lines anew that have something new."""
         changed = any(line.is_new for line in self.lines)
+        if changed:
+            self._due_lines = None
         for line in self.lines:
             line.refresh()
         if changed and self._config.wanted.overlap_percent is not None:
@@ -313,7 +366,10 @@ class LineWatch:
         }
 
     def plain_geometry(self) -> dict[str, Any]:
-        """Return the lines and the area in degrees, for maps."""
+        """Return the lines and the area in degrees, for maps; they never change."""
+        return self._geometry
+
+    def _drawn(self) -> dict[str, Any]:
         return {
             "lines": {
                 line.name: [
@@ -339,9 +395,16 @@ def mark_fixes(rows: StructArray, config: PlanConfig, best: int) -> int:
     Returns:
         The best quality so far.
     """
-    reached = np.maximum.accumulate(np.maximum(rows["fix"], best))
-    wanted = np.where(reached >= FIXED, FIXED, 1)
-    if config.wanted.fix != "auto":
-        wanted = np.full(len(rows), {"any": 1, "float": 2, "fixed": FIXED}[config.wanted.fix])
-    rows["is_fixed_enough"] = np.where(rows["fix"] < 0, -1, rows["fix"] >= wanted)
-    return int(reached[-1])
+    wanted = {"auto": 0, "any": 1, "float": 2, "fixed": FIXED}[config.wanted.fix]
+    return int(_mark(rows, wanted, best))
+
+
+@jit_cached
+def _mark(rows: Any, wanted: int, best: int) -> int:
+    """Do what `mark_fixes` does; ``wanted`` is a quality, 0: as good as the best one if that is fixed."""
+    for i in range(len(rows)):
+        fix = rows[i].fix
+        best = max(best, fix)
+        least = wanted if wanted > 0 else (FIXED if best >= FIXED else 1)
+        rows[i].is_fixed_enough = -1 if fix < 0 else (1 if fix >= least else 0)
+    return best

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,9 @@ import numpy as np
 
 from swath.daemon.processing.landing.command import FLOWN
 from swath.daemon.processing.landing.tracks import Track
-from swath.daemon.processing.live.tiles import replace_file
+from swath.daemon.processing.live.files import replace_file
 from swath.georef.arrays import FloatArray, Int64Array, StructArray
+from swath.georef.compiled import jit_cached
 from swath.georef.trajectory.trajectory import Poses
 
 POSE_NS = 200_000_000  # between two poses that are kept: 12 MB for five hours
@@ -50,14 +52,14 @@ class FlownTrack:
             for name, column in self._columns.items():
                 column.append(getattr(poses, name)[kept])
 
-    def returns(self, name: str, rows: StructArray) -> None:
-        """Take a scanner's returns (n,)."""
-        rows = rows[rows["number_of_returns"] > 0]
-        if len(rows):
+    def returns(self, name: str, rows: StructArray) -> int:
+        """Take a scanner's rows (n,), some of which may be pulses without a return; return the number of returns."""
+        half_rad, pulses, returns = _look(rows)
+        if returns:
             looked = self.scanners.setdefault(name, Looked())
-            angle = (rows["encoder_rad"] + np.pi) % (2.0 * np.pi) - np.pi
-            looked.half_rad = max(looked.half_rad, float(np.abs(angle).max()))
-            looked.pulses += int(np.count_nonzero(rows["return_number"] <= 1))
+            looked.half_rad = max(looked.half_rad, half_rad)
+            looked.pulses += pulses
+        return int(returns)
 
     def tick(self, names: list[str], seconds: float) -> None:
         """Note that returns of scanners came during a tick."""
@@ -87,3 +89,17 @@ class FlownTrack:
             **columns,
         )
         replace_file(folder / FLOWN, file.getvalue())
+
+
+@jit_cached
+def _look(rows: Any) -> tuple[float, int, int]:
+    """Return the largest angle from the middle of the scan, and the numbers of first returns and of all returns."""
+    half_rad, pulses, returns = 0.0, 0, 0
+    for i in range(len(rows)):
+        if rows[i].number_of_returns == 0:
+            continue
+        returns += 1
+        if rows[i].return_number <= 1:
+            pulses += 1
+        half_rad = max(half_rad, abs((rows[i].encoder_rad + math.pi) % (2.0 * math.pi) - math.pi))
+    return half_rad, pulses, returns

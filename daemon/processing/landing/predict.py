@@ -27,7 +27,8 @@ from swath.daemon.log.format import LogError
 from swath.daemon.processing.calibration.plan.run import EXPECTED, rows_of
 from swath.daemon.processing.calibration.run import PLANES
 from swath.daemon.processing.landing.command import FLOWN, PREDICTED
-from swath.daemon.processing.live.tiles import SIDE, Placement, TileReader, View, replace_file
+from swath.daemon.processing.live.files import replace_file
+from swath.daemon.processing.live.tiles import SIDE, Placement, TileReader, View
 from swath.daemon.processing.setup.setup import Options, Setup
 from swath.georef.arrays import FloatArray
 from swath.georef.geodesy.earth import e_from_geodetic

@@ -35,7 +35,7 @@ from swath.daemon.processing.landing.command import VERDICT, VERSION
 from swath.daemon.processing.landing.facts import LogFacts
 from swath.daemon.processing.landing.gaps import Gap, Ground, Painted, between, densities, gaps_of, inside
 from swath.daemon.processing.landing.tracks import pairs_of, tracks_of
-from swath.daemon.processing.live.tiles import replace_file
+from swath.daemon.processing.live.files import replace_file
 from swath.georef.arrays import BoolArray, FloatArray
 from swath.georef.timescales.gps_time import SECOND_NS
 

@@ -16,8 +16,9 @@ import numpy as np
 from pyproj import CRS
 from pyproj.exceptions import CRSError
 
+from swath.daemon.processing.live.files import replace_file
 from swath.daemon.processing.live.painting import COLOURS, IMAGE_CELLS, picture
-from swath.daemon.processing.live.tiles import SIDE, Layers, Placement, TileReader, replace_file
+from swath.daemon.processing.live.tiles import SIDE, Layers, Placement, TileReader
 from swath.daemon.written import PARTIAL
 
 GEOTIFF, KMZ = "coverage.tif", "coverage.kmz"

@@ -79,11 +79,11 @@ class LocalFrame:
         steps = np.linspace(-0.5, 0.5, PLACED_STEPS) * PLACED_M / EARTH_M
         up, across = (grid.ravel() for grid in np.meshgrid(steps, steps / max(math.cos(lat), 0.02), indexing="ij"))
         try:
-            local = self.of_points(self._mapped(e_from_geodetic(lat + up, lon + across, np.full(len(up), height))))
+            local = self.of_e(e_from_geodetic(lat + up, lon + across, np.full(len(up), height)))
         except ValueError:  # the frame ends nearby
             return None
         here = math.degrees(lat), math.degrees(lon)
-        middle = self.of_points(self._mapped(self._position_e[np.newaxis]))[0, :2]
+        middle = self.of_e(self._position_e[np.newaxis])[0, :2]
         return fit_placement(here, np.degrees(np.stack([up, across], axis=-1)), middle, local[:, :2])
 
     def of_points(self, points: FloatArray) -> FloatArray:
@@ -99,7 +99,11 @@ class LocalFrame:
         """
         lat, lon = np.radians(lat_lon_deg).T
         height = np.full(len(lat), float(geodetic_from_e(self._position_e)[2]))
-        return self.of_points(self._mapped(e_from_geodetic(lat, lon, height)))[:, :2]
+        return self.of_e(e_from_geodetic(lat, lon, height))[:, :2]
+
+    def of_e(self, positions_e: FloatArray) -> FloatArray:
+        """Return local coordinates (n, 3) of positions in e."""
+        return self.of_points(self._mapped(positions_e))
 
     def cloud_of(self, points: Points, keep: Int64Array) -> NDArray[Any]:
         """Return the points with the indexes ``keep`` as `CLOUD_DTYPE`."""
@@ -118,7 +122,7 @@ class LocalFrame:
         """
         places, q_local_from_b = np.empty((4, 3)), np.empty(4)
         _step_along(position_e, q_e_from_b, places)
-        mapped = self.of_points(self._mapped(places))
+        mapped = self.of_e(places)
         _attitude_of(mapped, q_local_from_b)
         return mapped[0], q_local_from_b
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from swath.daemon.processing.live.tiles import NO_DIFFERENCE, SIDE, Head, Place, pack_tile
+from swath.daemon.processing.live.tiles import NO_DIFFERENCE, SIDE, Head, Place, blank_tile
 from swath.georef.arrays import FloatArray, Int64Array, SingleArray, StructArray, UInt64Array
 from swath.georef.compiled import jit_cached
 from swath.georef.points import Points
@@ -158,7 +158,7 @@ class CellGrid:
         self._changed[:] = self._unseen[:] = 0
         self._changed[: self.held] = 1
 
-    def take_changed(self) -> Iterator[tuple[Place, Callable[[Head], bytes]]]:
+    def take_changed(self) -> Iterator[tuple[Place, Callable[[Head], bytearray]]]:
         """Yield the places of tiles that have changed since the last call, each with a function that makes its file."""
         for slot in np.flatnonzero(self._changed[: self.held]).tolist():
             column, row = self._places[slot].tolist()
@@ -177,15 +177,7 @@ class CellGrid:
         """True if a tile has changed since `take_changed`."""
         return bool(self._changed.any())
 
-    def _packed(self, slot: int, head: Head) -> bytes:
-        cells = self._cells[slot]
-        empty = cells["points"] == 0
-        stored = {name: cells[name] for name in CELL_DTYPE.names or ()}
-        stored["height"] = np.where(empty, np.float32(np.nan), cells["height"])
-        for name in ("lowest", "highest"):
-            stored[name] = np.where(empty, np.int16(NO_DIFFERENCE), cells[name])
-        # a difference of zero is stored as such only where one was found
-        stored["difference"] = np.where(cells["compared"] == 0, np.int16(NO_DIFFERENCE), cells["difference"])
+    def _packed(self, slot: int, head: Head) -> bytearray:
         whole = Head(
             head.column,
             head.row,
@@ -195,7 +187,9 @@ class CellGrid:
             float(self._bases[slot]),
             self.first_gps_s,
         )
-        return pack_tile(whole, stored)
+        data, layers = blank_tile(whole)
+        _split(self._cells[slot], *layers.values())
+        return data
 
     def set_differences(self, across: int, up: int, fine_m: float, cell_m: float, dz_m: SingleArray) -> None:
         """Set differences of strips; where there is one already, the larger remains.
@@ -424,6 +418,35 @@ def _paint_points(
 
 
 paint_points = jit_cached(_paint_points)
+
+
+@jit_cached
+def _split(
+    cells: Any,
+    points: Any,
+    pulses: Any,
+    height: Any,
+    lowest: Any,
+    highest: Any,
+    seconds: Any,
+    strip: Any,
+    difference: Any,
+    no_return: Any,
+    strips: Any,
+) -> None:
+    """Fill the layers of a tile's file, each (`SIDE`, `SIDE`), in the order of `STORED`, from its cells."""
+    for row in range(SIDE):
+        for column in range(SIDE):
+            cell = cells[row, column]
+            empty = cell.points == 0
+            points[row, column], pulses[row, column] = cell.points, cell.pulses
+            height[row, column] = np.float32(math.nan) if empty else cell.height
+            lowest[row, column] = NO_DIFFERENCE if empty else cell.lowest
+            highest[row, column] = NO_DIFFERENCE if empty else cell.highest
+            seconds[row, column], strip[row, column] = cell.seconds, cell.strip
+            # a difference of zero is stored as such only where one was found
+            difference[row, column] = cell.difference if cell.compared else NO_DIFFERENCE
+            no_return[row, column], strips[row, column] = cell.no_return, cell.strips
 
 
 @jit_cached

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swath.daemon.processing.live.tiles import replace_file
+from swath.daemon.processing.live.files import exchange_file
 from swath.georef.arrays import FloatArray, Int64Array, SingleArray
+from swath.georef.compiled import jit_cached
 from swath.georef.points import Points
 from swath.georef.timescales.gps_time import SECOND_NS
 
@@ -28,7 +29,7 @@ NADIR_RAD = math.radians(10.0)  # farther from the vertical a range is not one t
 BACK_NS = SECOND_NS  # from the newest point to the line of the profile: inclined beams have seen all of it by then
 STALE_NS = 2 * SECOND_NS  # without points: figures of the ground are no longer those of the present place
 HALF_WIDTH_M = 1.0  # of the profile
-PROFILE_POINTS = 1500
+PROFILE_POINTS = 600
 BEFORE_M = 200.0  # beyond the last points, as far as earlier strips are shown
 RECENT_S, RECENT_POINTS = 60, 50_000
 RECENT_HEAD = struct.Struct("<4sHHIIq")  # SWTR, version, bytes of the head and of a row, number of rows, GPS nanosecond
@@ -209,12 +210,12 @@ class LastLook:
     def _near(self, at_ns: int, here: FloatArray, along: FloatArray) -> tuple[FloatArray, FloatArray, Int64Array]:
         """Return the points near the line of the profile: east and north of its place (n, 2), up and GPS times."""
         found = [(np.zeros((0, 2)), np.zeros(0), np.zeros(0, np.int64))]
+        x, y = along.astype(np.float32).tolist()
         for block in self._blocks:
             if int(block.time_ns[0]) > at_ns + BACK_NS or int(block.time_ns[-1]) < at_ns - BACK_NS:
                 continue
-            x, y = along.astype(np.float32).tolist()
-            away_m = block.xyz[:, 0] * np.float32(x) + block.xyz[:, 1] * np.float32(y) - np.float32(here[:2] @ along)
-            near = np.flatnonzero(np.abs(away_m) <= HALF_WIDTH_M)
+            near = np.empty(len(block.time_ns), np.int64)
+            near = near[: _find_near(block.xyz, np.float32(x), np.float32(y), np.float32(here[:2] @ along), near)]
             xyz = block.xyz[near].astype(np.float64)
             found.append((xyz[:, :2] - here[:2], xyz[:, 2], block.time_ns[near]))
         off, up_m, time_ns = (np.concatenate(column) for column in zip(*found, strict=True))
@@ -224,18 +225,18 @@ class LastLook:
     def recent(self, edges: Int64Array) -> bytes:
         """Return the last minute's points, few of them, as the file ``recent.bin``: a head and `RECENT_DTYPE`."""
         blocks = list(self._recent)
-        rows = np.zeros(sum(len(block.time_ns) for block in blocks), RECENT_DTYPE)
         first_ns = int(blocks[0].time_ns[0]) if blocks else 0
         names = sorted({block.name for block in blocks})
-        done = 0
-        for block in blocks:
-            part = rows[done : done + len(block.time_ns)]
+        rows = np.zeros(sum(len(block.time_ns) for block in blocks), RECENT_DTYPE)
+        if blocks:
+            xyz = np.concatenate([block.xyz for block in blocks])
+            time_ns = np.concatenate([block.time_ns for block in blocks])
             for axis, column in enumerate(("east", "north", "up", "intensity")):
-                part[column] = block.xyz[:, axis]
-            part["seconds"] = (block.time_ns - first_ns) / SECOND_NS
-            part["strip"] = strips_at(block.time_ns, edges)
-            part["scanner"], part["return_number"] = names.index(block.name), block.return_number
-            done += len(part)
+                rows[column] = xyz[:, axis]
+            rows["seconds"], rows["strip"] = (time_ns - first_ns) / SECOND_NS, strips_at(time_ns, edges)
+            numbers = [names.index(block.name) for block in blocks]
+            rows["scanner"] = np.repeat(numbers, [len(block.time_ns) for block in blocks])
+            rows["return_number"] = np.concatenate([block.return_number for block in blocks])
         return RECENT_HEAD.pack(b"SWTR", 1, RECENT_HEAD.size, rows.itemsize, len(rows), first_ns) + rows.tobytes()
 
     def save(self, folder: Path, edges: Int64Array, earlier: Earlier, *, last: bool = False) -> None:
@@ -248,9 +249,9 @@ class LastLook:
         if self._saved % 2 or last:
             profile = self.profile(edges, earlier)
             if profile is not None:
-                replace_file(folder / PROFILE, (json.dumps(profile, separators=(",", ":")) + "\n").encode())
+                exchange_file(folder, PROFILE, (json.dumps(profile, separators=(",", ":")) + "\n").encode())
         if not self._saved % 2 or last:
-            replace_file(folder / RECENT, self.recent(edges))
+            exchange_file(folder, RECENT, self.recent(edges))
 
 
 def read_recent(data: bytes) -> tuple[NDArray[Any], int]:
@@ -281,3 +282,14 @@ def _put(strips: dict[str, dict[str, list[float]]], number: int, across_m: Float
         "across_m": np.round(across_m[order], 2).tolist(),
         "up_m": np.round(up_m[order], 3).tolist(),
     }
+
+
+@jit_cached
+def _find_near(xyz: Any, x: Any, y: Any, along_m: Any, near: Any) -> int:
+    """Fill ``near`` with the indexes of points (n, 4) near a line across the direction (x, y); return their number."""
+    count = 0
+    for i in range(len(xyz)):
+        if abs(xyz[i, 0] * x + xyz[i, 1] * y - along_m) <= HALF_WIDTH_M:
+            near[count] = i
+            count += 1
+    return count

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swath.daemon.png import png
+from swath.daemon.processing.live.files import replace_file
 from swath.daemon.processing.live.frame import LocalFrame
 from swath.daemon.processing.live.grid import CellGrid
 from swath.daemon.processing.live.strips import StripComparison, StripCutter
-from swath.daemon.processing.live.tiles import FILE_BYTES, INDEX, TILES, Head, Place, TileFolder, replace_file
+from swath.daemon.processing.live.tiles import FILE_BYTES, INDEX, TILES, Head, Place, TileFolder
 from swath.georef.arrays import ByteArray
 from swath.georef.points import Points
 from swath.georef.timescales.gps_time import SECOND_NS
@@ -119,7 +120,7 @@ class LiveMap:
         except OSError as error:
             self.trouble = f"{TILES}/{INDEX}: {error.strerror or error}: the map's tiles are not written"
 
-    def _within_quota(self, folder: TileFolder) -> Iterator[tuple[Place, Callable[[Head], bytes]]]:
+    def _within_quota(self, folder: TileFolder) -> Iterator[tuple[Place, Callable[[Head], bytearray]]]:
         """Yield the changed tiles, without new ones if there is no room for them."""
         for place, make in self.grid.take_changed():
             if folder.has(place) or folder.size + FILE_BYTES <= self._quota_bytes:

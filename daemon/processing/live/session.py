@@ -25,12 +25,13 @@ from swath.daemon.processing.landing.checks import Covered
 from swath.daemon.processing.landing.command import PAGE, PRINTED, VERDICT, PagePrinter
 from swath.daemon.processing.landing.page import landing_page, read_verdict
 from swath.daemon.processing.landing.watch import Landing, Places
+from swath.daemon.processing.live.files import replace_file
 from swath.daemon.processing.live.follow import LiveFollower, LivePart, Skipped
 from swath.daemon.processing.live.lines import LINES, LiveLines
 from swath.daemon.processing.live.points import PointsFile
 from swath.daemon.processing.live.products import LiveProducts, Room
 from swath.daemon.processing.live.status import LiveStatus, sentence, write_status
-from swath.daemon.processing.live.tiles import FOLDER, Placement, replace_file
+from swath.daemon.processing.live.tiles import FOLDER, Placement
 from swath.daemon.processing.live.unanswered import UnansweredPulses
 from swath.daemon.processing.pages.head import calibrations_words, crs_words
 from swath.daemon.processing.points.feed import LogFeed, Placed
@@ -42,6 +43,7 @@ from swath.georef.georeference import Georeferencer
 from swath.georef.trajectory.trajectory import Trajectory
 
 POLL_S = 0.05
+SAVE_NS = 100_000_000  # of the log's time, between two looks for what has to be written
 STATUS_S = 1.0
 PRINT_WAIT_S = 8.0  # for the page at the end; the service has to end in time
 COVERAGE_S = 10.0
@@ -105,7 +107,7 @@ class LiveSession:
         self.info = info
         source = "navigated" if setup.sources.ins_source is None else "ins"
         self.verdict = verdict_entry(list(calibration_verdicts(setup, source)), accepted=accept_verdict)
-        self.now_ns = 0
+        self.now_ns = self._saved_ns = 0
         self._stream = setup.live_stream(info)
         self._path = _SeenPath(self._stream.path)
         self._stream.path = self._path
@@ -161,10 +163,12 @@ class LiveSession:
         if placed:
             self._give(placed, live=live)
         self.products.take_pose(self._path.trajectory, self.now_ns)
-        self.products.save_map({"session_id": self.info.session_id}, self.now_ns)
-        self._save_lines()
-        if self.landing.is_due(self.now_ns):
-            self._save_verdict(live=live)
+        if self.now_ns >= self._saved_ns + SAVE_NS:
+            self._saved_ns = self.now_ns
+            self.products.save_map({"session_id": self.info.session_id}, self.now_ns)
+            self._save_lines()
+            if self.landing.is_due(self.now_ns):
+                self._save_verdict(live=live)
 
     def _save_verdict(self, *, live: bool, last: bool = False) -> None:
         """Write the verdict before landing, unless free space is low."""

@@ -17,9 +17,9 @@ from swath.calib.strips.standards import QUALITY_LEVELS
 from swath.daemon.log.format import source_of_topic
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.processing.carried_verdict import first_lines
+from swath.daemon.processing.live.files import exchange_file
 from swath.daemon.processing.live.follow import BEHIND_NS, LiveFollower
 from swath.daemon.processing.live.products import LiveProducts
-from swath.daemon.processing.live.tiles import replace_file
 from swath.daemon.processing.points.time_checks import time_trouble
 from swath.daemon.processing.setup.setup import Setup
 from swath.georef.arrays import FloatArray, Int64Array
@@ -280,4 +280,4 @@ def write_status(folder: Path, found: dict[str, Any]) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    replace_file(folder / STATUS, (json.dumps(found, indent=2) + "\n").encode())
+    exchange_file(folder, STATUS, (json.dumps(found, indent=2) + "\n").encode())

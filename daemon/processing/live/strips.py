@@ -8,7 +8,6 @@ flown only its planes are kept, and of each cell only the newest strip's.
 from __future__ import annotations
 
 import math
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -30,6 +29,8 @@ from swath.daemon.processing.quicklook.strips import (
 )
 from swath.georef.arrays import BoolArray, FloatArray, Int64Array, SingleArray, StructArray
 from swath.georef.compiled import jit_cached
+from swath.georef.geodesy.earth import geodetic_of
+from swath.georef.geodesy.vectors import heading_and_roll, rot_at, vector_at
 from swath.georef.points import Points
 from swath.georef.strips import Span, StripRules, straight_spans
 from swath.georef.timescales.gps_time import SECOND_NS
@@ -101,7 +102,8 @@ class StripCutter:
         self.dropped: list[int] = []
         self._rules = rules or StripRules()
         self._gps_from_host = gps_from_host
-        self._seen: deque[tuple[int, float, float]] = deque()  # GPS time, heading, roll
+        self._times: Int64Array = np.zeros(0, np.int64)  # of the attitudes seen
+        self._seen: FloatArray = np.zeros((0, 2))  # heading, roll
         self._looked_ns = self._newest_ns = 0
         self._is_straight = False
         self._laser_to_ns = 0  # host time of the last data of a scanner
@@ -134,7 +136,7 @@ class StripCutter:
         if self.open is not None:
             if self._is_straight and spans[-1][0] <= self.open.end_ns + STEP_NS:
                 self.open.end_ns = self._newest_ns + 1
-                if spans[-1][0] - self._seen[0][0] > self._rules.window_s * SECOND_NS:  # the turn before is seen too
+                if spans[-1][0] - int(self._times[0]) > self._rules.window_s * SECOND_NS:  # the turn before is seen too
                     self.open.start_ns = self._start_ns(spans[-1])
                 return
             if not self._is_straight and turned_ns < self._rules.min_turn_s * SECOND_NS:
@@ -168,28 +170,19 @@ class StripCutter:
             return
         span_ns = max(1, int(time_ns[-1] - time_ns[first]))
         rows = np.arange(first, len(time_ns), max(1, (len(time_ns) - 1 - first) * STEP_NS // span_ns))
-        picked = Trajectory(
-            trajectory.time_ns[rows],
-            trajectory.position_e[rows],
-            trajectory.q_e_from_b[rows],
-            trajectory.velocity_e[rows],
-            trajectory.position_sigma_l[rows],
-            trajectory.attitude_sigma_rad[rows],
-        )
-        roll, _, heading = (np.nan_to_num(angle).tolist() for angle in picked.attitude())
-        self._seen.extend(zip(picked.time_ns.tolist(), heading, roll, strict=True))
-        self._newest_ns = self._seen[-1][0]
-        while self._newest_ns - self._seen[0][0] > SEEN_NS:
-            self._seen.popleft()
+        seen = np.empty((len(rows), 2))
+        _fill_attitudes(trajectory.position_e, trajectory.q_e_from_b, rows, seen)
+        self._newest_ns = int(time_ns[rows[-1]])
+        times = np.concatenate([self._times, time_ns[rows]])
+        kept = int(np.searchsorted(times, self._newest_ns - SEEN_NS))
+        self._times, self._seen = times[kept:], np.concatenate([self._seen, np.nan_to_num(seen)])[kept:]
 
     def _straight(self) -> list[Span]:
         """Return straight spans of the last seconds; gaps of the trajectory count as straight, as in the office."""
-        rows = list(self._seen)
-        times = np.array([row[0] for row in rows], np.int64)
+        times = self._times
         holes = np.flatnonzero(np.diff(times) > HOLE_NS)
         unknown = [(int(times[hole]), int(times[hole + 1])) for hole in holes]
-        heading, roll = (np.array([row[k] for row in rows]) for k in (1, 2))
-        return straight_spans(times, heading, roll, self._rules, unknown)
+        return straight_spans(times, self._seen[:, 0], self._seen[:, 1], self._rules, unknown)
 
     def _look_for_laser(self, now_ns: int) -> None:
         gap, self._laser_gap = self._laser_gap, None
@@ -337,12 +330,12 @@ class StripComparison:
         cells = places / self._side_m
         across, up = (np.floor(cells[:, axis]).astype(np.int64) for axis in (0, 1))
         side = SIDE >> self._levels
-        tiles = np.stack([across // side, up // side], axis=-1)
-        for column, row in np.unique(tiles, axis=0).tolist():
-            kept = self._planes.get((column, row))
+        tiles = (across // side) * (2 * FARTHEST) + up // side
+        for tile in np.unique(tiles).tolist():
+            own = np.flatnonzero(tiles == tile)
+            kept = self._planes.get((int(across[own[0]]) // side, int(up[own[0]]) // side))
             if kept is None:
                 continue
-            own = np.flatnonzero((tiles[:, 0] == column) & (tiles[:, 1] == row))
             planes = kept[up[own] % side, across[own] % side]
             x, y = (cells[own, axis] - np.floor(cells[own, axis]) - 0.5 for axis in (0, 1))
             east, north = planes["east"].astype(np.float64), planes["north"].astype(np.float64)
@@ -435,6 +428,14 @@ class StripComparison:
         new["strip"] = self._number
         kept[enough] = np.where(found.smooth, new, before)
         return dz_m
+
+
+@jit_cached
+def _fill_attitudes(position_e: Any, q_e_from_b: Any, rows: Any, seen: Any) -> None:
+    """Fill ``seen`` (n, 2) with heading (0 … 2π) and roll at the epochs ``rows`` (n,) of a trajectory."""
+    for i in range(len(rows)):
+        lat, lon, _ = geodetic_of(*vector_at(position_e, rows[i]))
+        seen[i, 0], seen[i, 1] = heading_and_roll(lat, lon, rot_at(q_e_from_b, rows[i]))
 
 
 @jit_cached

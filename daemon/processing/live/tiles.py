@@ -23,6 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swath.daemon.processing.live.files import exchange_file
+
 FOLDER = "live"  # of all that live writes for other programs, in the log directory
 TILES, INDEX = "tiles", "index.json"
 SUFFIX = ".tile"
@@ -70,13 +72,6 @@ Place = tuple[int, int]  # column and row of a tile, counted from the origin
 Layers = dict[str, NDArray[Any]]
 
 
-def replace_file(path: Path, data: bytes) -> None:
-    """Replace a file's content at once: a reader sees the old or the new one, never a part."""
-    new = path.with_name(path.name + ".new")
-    new.write_bytes(data)
-    new.replace(path)
-
-
 @dataclass(frozen=True, slots=True)
 class Head:
     """The head of a tile file.
@@ -116,9 +111,14 @@ class Head:
         return cls(column, row, generation, cell_m, sequence, base_m, first_gps_s)
 
 
-def pack_tile(head: Head, stored: Mapping[str, NDArray[Any]]) -> bytes:
-    """Return a tile file of stored values by name, each (`SIDE`, `SIDE`)."""
-    return b"".join([head.pack(), *(np.asarray(stored[name], kind).tobytes() for name, kind in STORED.items())])
+def blank_tile(head: Head) -> tuple[bytearray, Layers]:
+    """Return a tile file to be filled: its bytes, and in them the stored layers, each (`SIDE`, `SIDE`)."""
+    data = bytearray(FILE_BYTES)
+    data[:HEAD_BYTES] = head.pack()
+    layers = {
+        name: np.frombuffer(data, kind, SIDE * SIDE, _PLACES[name]).reshape(SIDE, SIDE) for name, kind in STORED.items()
+    }
+    return data, layers
 
 
 class TileFolder:
@@ -153,7 +153,7 @@ class TileFolder:
         self._sequences.clear()
         self._cleared = False
 
-    def write(self, tiles: Iterable[tuple[Place, Callable[[Head], bytes]]], about: Mapping[str, Any]) -> None:
+    def write(self, tiles: Iterable[tuple[Place, Callable[[Head], bytearray]]], about: Mapping[str, Any]) -> None:
         """Write tiles and then the index.
 
         Args:
@@ -168,7 +168,7 @@ class TileFolder:
         sequence = self.sequence + 1
         for place, make in tiles:
             head = Head(*place, self.generation, float(about["cell_m"]), sequence, 0.0, 0)
-            replace_file(self._folder / name_of(place), make(head))
+            exchange_file(self._folder, name_of(place), make(head))
             self._sequences[place] = sequence
         index = {
             "version": VERSION,
@@ -178,7 +178,7 @@ class TileFolder:
             **about,
             "tiles": {f"{column}_{row}": at for (column, row), at in self._sequences.items()},
         }
-        replace_file(self._folder / INDEX, json.dumps(index, separators=(",", ":")).encode())
+        exchange_file(self._folder, INDEX, json.dumps(index, separators=(",", ":")).encode())
         self.sequence = sequence
         if not self._cleared:
             self._remove_others()

@@ -424,7 +424,7 @@ class TestWires:
             text = (folder / "swath.toml").read_text()
             head = session_table(folder / "logs", name='"tiny"')
             config = text.replace(text[: text.index("[pps.main]")], head)
-            for name in ("left.nominal.toml", "main.dbc"):
+            for name in ("left.nominal.toml", "main.dbc", "plan.toml"):
                 (tmp_path / name).write_bytes((folder / name).read_bytes())
             with Recorder(tmp_path, config) as recorder:
                 _, said = flying.communicate(timeout=HANGS_S)

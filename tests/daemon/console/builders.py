@@ -15,6 +15,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from PIL import Image
 from pyproj import Transformer
 
 from swath.daemon.processing.live.frame import LocalFrame
-from swath.daemon.processing.live.tiles import SIDE, STORED, TileFolder, pack_tile
+from swath.daemon.processing.live.tiles import Head, TileFolder, blank_tile
 from tests.builders import running
 from tests.daemon.rig import HANGS_S
 
@@ -137,10 +138,14 @@ def write_map(
 ) -> None:
     """Write a map of tiles, each by stored layers (`SIDE`, `SIDE`), rows from the south; the others are zero."""
     live.mkdir(parents=True, exist_ok=True)
-    nothing = {name: np.zeros((SIDE, SIDE), kind) for name, kind in STORED.items()}
-    made = [
-        (place, lambda head, layers=layers: pack_tile(head, nothing | dict(layers))) for place, layers in tiles.items()
-    ]
+
+    def packed(layers: Mapping[str, NDArray[Any]], head: Head) -> bytearray:
+        data, stored = blank_tile(head)
+        for name, values in layers.items():
+            stored[name][:] = values
+        return data
+
+    made = [(place, partial(packed, layers)) for place, layers in tiles.items()]
     TileFolder(live).write(made, {"cell_m": cell_m} | about)
 
 

@@ -56,7 +56,7 @@ def with_records(text: str) -> str:
             table = "\n".join(
                 [f"{name}]", f'transport = "udp:0.0.0.0:{9000 + number}"', 'protocol = "records"', *kept, ""]
             )
-        if not name.startswith(("[scanner", "[pps", "[imu.main.signals", "[output")):
+        if not name.startswith(("[scanner", "[pps", "[imu.main.signals", "[output", "[plan")):
             made += table + "\n"
     return made
 

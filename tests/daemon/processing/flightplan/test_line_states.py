@@ -191,7 +191,7 @@ def test_moments_wait_for_returns_and_tell_water_from_silence() -> None:
         gps_ns = place * STEP_NS
         if place < 20:
             join.returns_at(gps_ns, "left").first = 100
-        join.add_seen(gps_ns, "left", 90 if place >= 50 else 0, 100 if place < 30 else 0)
+        join.add_seen([gps_ns - STEP_NS, gps_ns], "left", 90 if place >= 50 else 0, 100 if place < 30 else 0)
     join.add_poses(rows)
     settled = join.settled()
     assert len(settled) == 29  # older than 3 s

@@ -50,7 +50,7 @@ PART_MINUTES = 0.035  # about two seconds
 def config_of(wires: Path, folder: Path) -> str:
     """Return the configuration that reads a flight's wires; copy the files that it names into the folder."""
     wait_until((wires / "pps-main").exists, "the last of the wires")
-    for path in [*wires.glob("*.true.toml"), wires / "main.dbc"]:
+    for path in [*wires.glob("*.true.toml"), wires / "main.dbc", wires / "plan.toml"]:
         (folder / path.name).write_bytes(path.read_bytes())
     text = (wires / "swath.toml").read_text().replace('"novatel"', '"novatel"\ndatum = "same"')
     text = text.replace(".nominal.toml", ".true.toml")

@@ -66,7 +66,7 @@ class Flown:
         text = text.replace('protocol = "novatel"', 'protocol = "novatel"\ndatum = "same"')
         # the log ends before the flight's first line begins: the plan of lines has it begin sooner
         (folder / "plan.toml").write_text(PLAN.replace("from_m = [-150, 0]", "from_m = [-650, 0]"))
-        (folder / "swath.toml").write_text(text + '[plan]\nfile = "plan.toml"\n')
+        (folder / "swath.toml").write_text(text)
         self.config: Config = load_config(folder / "swath.toml")
         report = fly_into_log(self.config, folder / "logs", flight, plan.tables.flight.seed)
         self.paths = report.paths

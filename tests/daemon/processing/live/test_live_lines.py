@@ -64,7 +64,7 @@ def flown(folder: Path, plan: Plan, planned: str) -> Path:
     (folder / "plan.toml").write_text(planned)
     text = config_text(plan, default_wires(plan), "logs").replace('"novatel"', '"novatel"\ndatum = "same"')
     text = text.replace("nominal.toml", "true.toml")
-    text += '[plan]\nfile = "plan.toml"\n[plan.wanted]\ndensity_per_m2 = 0.1\noverlap_percent = 20\n'
+    text += "[plan.wanted]\ndensity_per_m2 = 0.1\noverlap_percent = 20\n"
     text += 'quality_level = "QL2"\n'
     (folder / "swath.toml").write_text(text)
     return fly_into_log(load_config(folder / "swath.toml"), folder / "logs", flight, plan.tables.flight.seed).paths[0]
