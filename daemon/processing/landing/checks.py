@@ -161,12 +161,12 @@ def _why(line: Mapping[str, Any]) -> str:
 # ---------------------------------------------------------------------------------------------- area
 
 
-def gaps_check(covered: Covered | None, limit_m2: float) -> Check:
-    """Judge the gaps."""
+def gaps_check(lines: Mapping[str, Any], covered: Covered | None, limit_m2: float) -> Check:
+    """Judge the gaps; those of a line that the operator has accepted are accepted too."""
     title = "Gaps"
     if covered is None:
         return Check("gaps", title, UNKNOWN, "no point yet")
-    bare = [gap for gap in covered.gaps if not gap.under]
+    bare = _bare(lines, covered)
     details = [f"gap {gap.number}: {gap.text}" for gap in covered.gaps]
     if covered.more:
         details.append(f"and {covered.more} smaller ones, whose places are not looked at")
@@ -182,6 +182,16 @@ def gaps_check(covered: Covered | None, limit_m2: float) -> Check:
         return Check("gaps", title, AGAIN if bare else UNKNOWN, text, tuple(details))
     state = AGAIN if bare else REMARK if covered.gaps else GOOD
     return Check("gaps", title, state, f"{found}; {size}", tuple(details))
+
+
+def _bare(lines: Mapping[str, Any], covered: Covered) -> list[FoundGap]:
+    """Return the gaps that no swath has covered and no line explains that the operator has accepted."""
+    accepted = _accepted(lines)
+    return [gap for gap in covered.gaps if not gap.under and gap.line not in accepted]
+
+
+def _accepted(lines: Mapping[str, Any]) -> set[str]:
+    return {line["name"] for line in lines["lines"] if (line.get("overruled") or {}).get("verdict") == "accepted"}
 
 
 def density_check(lines: Mapping[str, Any], wanted: PlanWantedConfig, covered: Covered | None) -> Check:
@@ -227,7 +237,7 @@ def overlap_check(lines: Mapping[str, Any], wanted: PlanWantedConfig, difference
 
 def _with(lines: Mapping[str, Any], code: str) -> list[tuple[str, Mapping[str, Any]]]:
     """Return lines and their reasons of a code, without those that the operator has accepted."""
-    accepted = {one["name"] for one in lines["lines"] if (one.get("overruled") or {}).get("verdict") == "accepted"}
+    accepted = _accepted(lines)
     return [
         (line["name"], reason)
         for line in lines["lines"]
@@ -381,7 +391,7 @@ def log_check(facts: LogFacts, follower: Mapping[str, Any]) -> Check:
 def sentence(lines: Mapping[str, Any], checks: Sequence[Check], covered: Covered | None) -> tuple[str, str]:
     """Return `HOME`, `FLY_AGAIN` or `WAIT`, and the verdict in one sentence."""
     again, planned, flying = (of_state(lines, state) for state in ("again", "planned", "flying"))
-    gaps = [] if covered is None else [gap for gap in covered.gaps if not gap.under]
+    gaps = [] if covered is None else _bare(lines, covered)
     parts = [f"Fly again: {_lines(again)}" if again else "", f"Not flown: {_lines(planned)}" if planned else ""]
     own = [gap for gap in gaps if gap.line not in {*again, *planned, *flying}]
     if own:

@@ -267,7 +267,7 @@ class Landing:
         track = facts.track
         checks = [
             lines_check(lines, trouble),
-            gaps_check(covered, wanted.gap_m2),
+            gaps_check(lines, covered, wanted.gap_m2),
             density_check(lines, wanted, covered),
             overlap_check(lines, wanted, differences),
             calibration_check(pairs_of(tracks_of(track)), self._calibration),

@@ -113,6 +113,16 @@ def test_the_operator_s_word_counts() -> None:
     assert check(found, "lines")["details"][1] == "line 2: operator: fly again"
 
 
+def test_gaps_of_an_accepted_line_are_accepted_too() -> None:
+    flight = flown(parallel(2, SPACING_M), [Defect("1", "silent", 0.5, 5.0)], {}, turbulence="none")
+    corners = np.array([[10.0, -300.0], [1190.0, -300.0], [1190.0, SPACING_M + 300.0], [10.0, SPACING_M + 300.0]])
+    rows, plan = moments_of(flight), with_area(flight.plan, places_of(flight), corners)
+    assert verdict_of(flight, rows, plan)["sentence"] == "Fly again: line 1"
+    found = verdict_of(flight, rows, plan, marks=("line 1: accepted, quarry",))
+    assert (found["state"], states(found)["gaps"]) == ("home", "remark")
+    assert found["sentence"].startswith("You can go home. With remarks: lines, gaps")
+
+
 def test_what_live_has_not_seen_is_not_good() -> None:
     flight = flown(parallel(1, SPACING_M), [], {}, turbulence="none")
     found = verdict_of(flight, moments_of(flight), live_skipped_s=12.0, damaged_chunks=2)
