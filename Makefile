@@ -21,7 +21,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-peers test-vm test-vm-long test-arm64 test-long soak soak-short fuzz lint ready programs for-tiers for-peers for-vm bench bench-calibration install uninstall clean
+.PHONY: help demo test test-slow test-peers pictures test-vm test-vm-long test-arm64 test-long soak soak-short fuzz lint ready programs for-tiers for-peers for-vm bench bench-calibration install uninstall clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -40,6 +40,9 @@ test-slow: $(VENV)/.tests $(VENV)/.tools ready ## run the longer tests: whole fl
 
 test-peers: $(VENV)/.tests for-peers ## run the tests against gpsd, Foxglove's reader and Chromium, which it installs (root, apt, npm)
 	$(PYTEST) -n 0 -v tests/peers
+
+pictures: $(VENV)/.tests for-peers ## make the pictures of docs/console.md again, by Chromium (3 min)
+	$(BIN)/python -m tests.peers.console_pictures
 
 test-vm: $(VENV)/.tests for-vm ## run the tests of CAN, PPS, systemd and power cuts in a virtual machine, which it installs (root, apt, alone)
 	$(PYTEST) -n 2 --dist loadfile -v -m "not alone and not long" tests/vm

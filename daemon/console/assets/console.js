@@ -93,7 +93,7 @@ function showSensors(found) {
     notes.push(`${source}: ${rates.join(", ") || "nothing decoded"}`);
   }
   for (const [source, one] of Object.entries(found.live.gnss ?? {})) {
-    const parts = [one.fix, one.satellites === null ? null : `${one.satellites} satellites`, one.sigma_m === null ? null : `±${number(one.sigma_m, 3)} m`];
+    const parts = [one.fix, one.satellites === null ? null : `${one.satellites} satellites`, one.sigma_m ? `±${number(Math.max(...one.sigma_m), 3)} m` : null];
     notes.push(`${source}: ${parts.filter((part) => part).join(", ")}`);
   }
   if (found.live.navigation) notes.push(`navigation: ${found.live.navigation}`);

@@ -57,7 +57,7 @@ export async function ask(path, what) {
 
 export const clock = (ms) => (ms === null ? "" : new Date(ms).toISOString().slice(11, 19));
 export const number = (value, digits = 0) =>
-  value === null || value === undefined ? "–" : value.toLocaleString("en-US", { maximumFractionDigits: digits, minimumFractionDigits: digits }).replace("-", "−");
+  value === null || value === undefined ? "–" : value.toLocaleString("en-US", { maximumFractionDigits: digits, minimumFractionDigits: digits }).replace(/^-(?=[0.]*$)/, "").replace("-", "−");
 
 export function pressed(id, otherwise, change) {
   const button = document.getElementById(id);

@@ -126,7 +126,7 @@ function showAircraft(pose) {
   const grid = (pose.map_heading_deg ?? pose.heading_deg) - pose.heading_deg; // from true north to the map's
   if (!aircraft) {
     aircraft = L.marker(place, { icon: plane(), interactive: false, keyboard: false, alt: "aircraft" }).addTo(map);
-    trail = L.polyline([], { color: "#14181c", weight: 2, opacity: 0.6 }).addTo(map);
+    trail = L.polyline([], { color: "#7b8790", weight: 2 }).addTo(map);
     map.setView(place, -1);
   }
   aircraft.setLatLng(place);
@@ -159,7 +159,8 @@ function turn(trackDeg) {
     map.dragging.enable();
     map.invalidateSize({ animate: false });
   }
-  frame.style.transform = `translate(-50%, -50%) rotate(${degrees}deg)`;
+  // not turned, its pixels are those of the screen: no seams between squares
+  frame.style.transform = up ? `translate(-50%, -50%) rotate(${degrees}deg)` : "";
   $("north").style.transform = `rotate(${degrees}deg)`;
 }
 
