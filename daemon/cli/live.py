@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from swath.daemon.config import Config
     from swath.daemon.config.tables import LiveConfig
+    from swath.daemon.processing.live.serve import LiveServer
 
 JOURNAL_S = 60.0  # between two lines for the journal; systemd shows the status all the time
 
@@ -51,6 +52,10 @@ def command(
     points: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Also write all points as one array (.npy), for comparisons.")
     ] = None,
+    serve: Annotated[
+        bool, typer.Option("--serve", help="Also serve live.mcap's topics to Foxglove, on this computer only.")
+    ] = False,
+    serve_port: Annotated[int, typer.Option(help="--serve: port to listen at.", min=0, max=65535)] = 8765,
     accept_verdict: AcceptVerdict = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the status as JSON, one object per line.")] = False,
 ) -> None:
@@ -63,13 +68,32 @@ def command(
     require_installed("swath live", "foxglove")
     _check(where, output, replay=replay)
     paths = where or [DEFAULT_CONFIG]
-    if replay:
-        _refuse_unusable(_replay(paths, output or Path(), points, accept_verdict=accept_verdict, as_json=as_json))
-        return
-    found = _follow(paths[0], points, from_start=from_start, accept_verdict=accept_verdict, as_json=as_json)
+    with _serving(serve_port if serve else None) as server:
+        if replay:
+            found = _replay(paths, output or Path(), points, server, accept_verdict=accept_verdict, as_json=as_json)
+        else:
+            found = _follow(
+                paths[0], points, server, from_start=from_start, accept_verdict=accept_verdict, as_json=as_json
+            )
     if "no end" in found["state"]:
         raise typer.Exit(int(ExitCode.PROBLEM))
     _refuse_unusable(found)
+
+
+@contextlib.contextmanager
+def _serving(port: int | None) -> Iterator[LiveServer | None]:
+    """Serve Foxglove's viewer during the block; without a port, nothing is served."""
+    if port is None:
+        yield None
+        return
+    from swath.daemon.processing.live.serve import ADDRESS, LiveServer
+
+    server = LiveServer(port)
+    print(f"serving ws://{ADDRESS}:{server.port} for Foxglove", file=sys.stderr, flush=True)
+    try:
+        yield server
+    finally:
+        server.close()
 
 
 def _refuse_unusable(found: dict[str, Any]) -> None:
@@ -110,7 +134,13 @@ def _stop_signals() -> Iterator[list[int]]:
 
 
 def _follow(
-    where: Path, points: Path | None, *, from_start: bool, accept_verdict: bool, as_json: bool
+    where: Path,
+    points: Path | None,
+    server: LiveServer | None,
+    *,
+    from_start: bool,
+    accept_verdict: bool,
+    as_json: bool,
 ) -> dict[str, Any]:
     """Follow a recording until it ends or a signal stops it.
 
@@ -150,6 +180,7 @@ def _follow(
             points=points,
             prepare=get_ready,
             accept_verdict=accept_verdict,
+            server=server,
         )
         return following.run(lambda: bool(stop))
 
@@ -221,7 +252,13 @@ def page(found: dict[str, Any]) -> Group:
 
 
 def _replay(
-    paths: list[Path], output: Path, points: Path | None, *, accept_verdict: bool, as_json: bool
+    paths: list[Path],
+    output: Path,
+    points: Path | None,
+    server: LiveServer | None,
+    *,
+    accept_verdict: bool,
+    as_json: bool,
 ) -> dict[str, Any]:
     from swath.daemon.config import load_config
     from swath.daemon.log.format import LogError
@@ -247,6 +284,6 @@ def _replay(
     options = Options(uncertainty=False)
     setup = Setup.of_session(sessions[0], config, options)
     live: LiveConfig = setup.config.tables.live
-    found = replay(sessions[0], setup, output, live, points, accept_verdict=accept_verdict)
+    found = replay(sessions[0], setup, output, live, points, accept_verdict=accept_verdict, server=server)
     print(json.dumps(found, indent=2) if as_json else found["sentence"])
     return found

@@ -78,10 +78,6 @@ class LiveMcap:
         self._writer.add_metadata("swath.live", metadata)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        self._cloud_fields = [
-            fox.PackedElementField(name=str(name), offset=4 * i, type=fox.PackedElementFieldNumericType.Float32)
-            for i, name in enumerate(CLOUD_DTYPE.names or ())
-        ]
         self._since_flush = 0
         self._last_size = 0
         self._chunks = 0
@@ -95,52 +91,11 @@ class LiveMcap:
             self._last_size, self._since_flush = written, 0
         return written + self._since_flush + END_BYTES + END_BYTES_PER_CHUNK * self._chunks
 
-    def add_cloud(self, topic: str, points: NDArray[Any], time_ns: int, log_time_ns: int) -> bool:
-        """Add points (n,) of `CLOUD_DTYPE` in the frame ``local``; return True if they were written."""
-        cloud = fox.PointCloud(
-            timestamp=_stamp(time_ns),
-            frame_id=FRAME,
-            pose=fox.Pose(position=fox.Vector3(x=0, y=0, z=0), orientation=fox.Quaternion(x=0, y=0, z=0, w=1)),
-            point_stride=CLOUD_DTYPE.itemsize,
-            fields=self._cloud_fields,
-            data=points.tobytes(),
-        )
-        return self._add(topic, cloud, log_time_ns)
-
-    def add_pose(self, pose: LivePose, log_time_ns: int) -> bool:
-        """Add position, pose and the transform to the body; return True if they were written."""
-        stamp = _stamp(pose.time_ns)
-        w, *xyz = pose.q_local_from_b.tolist()
-        turned = fox.Quaternion(x=xyz[0], y=xyz[1], z=xyz[2], w=w)
-        x, y, z = pose.position.tolist()
-        place = fox.Vector3(x=x, y=y, z=z)
-        known = bool(np.isfinite(pose.sigma_l).all())
-        kinds = fox.LocationFixPositionCovarianceType
-        north, east, down = (pose.sigma_l**2).tolist() if known else (0.0, 0.0, 0.0)
-        fix = fox.LocationFix(
-            timestamp=stamp,
-            frame_id=BODY,
-            latitude=pose.lat_deg,
-            longitude=pose.lon_deg,
-            altitude=pose.height_m,
-            position_covariance=[east, 0, 0, 0, north, 0, 0, 0, down],
-            position_covariance_type=kinds.DiagonalKnown if known else kinds.Unknown,
-        )
-        transform = fox.FrameTransform(
-            timestamp=stamp, parent_frame_id=FRAME, child_frame_id=BODY, translation=place, rotation=turned
-        )
-        in_frame = fox.PoseInFrame(timestamp=stamp, frame_id=FRAME, pose=fox.Pose(position=place, orientation=turned))
-        written = True
-        for topic, message in {"/position": fix, "/pose": in_frame, "/tf": transform}.items():
-            written &= self._add(topic, message, log_time_ns)
-        return written
-
-    def _add(self, topic: str, message: Any, log_time_ns: int) -> bool:
-        data = message.encode()
+    def add(self, topic: str, schema: Any, data: bytes, log_time_ns: int) -> bool:
+        """Add a message, encoded as its schema says; return True if it was written."""
         if self._is_beyond(len(data)):
             return False
         if topic not in self._channels:
-            schema = message.get_schema()
             if schema.name not in self._schemas:
                 self._schemas[schema.name] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
             self._channels[topic] = self._writer.register_channel(topic, "protobuf", self._schemas[schema.name])
@@ -169,6 +124,74 @@ class LiveMcap:
             self._writer.finish()
         finally:
             self._file.close()
+
+
+def cloud_message(points: NDArray[Any], time_ns: int) -> Any:
+    """Return points (n,) of `CLOUD_DTYPE` in the frame ``local`` as a message."""
+    return fox.PointCloud(
+        timestamp=_stamp(time_ns),
+        frame_id=FRAME,
+        pose=_pose(fox.Vector3(x=0, y=0, z=0)),
+        point_stride=CLOUD_DTYPE.itemsize,
+        fields=[_field(str(name), 4 * place) for place, name in enumerate(CLOUD_DTYPE.names or ())],
+        data=points.tobytes(),
+    )
+
+
+def pose_messages(pose: LivePose) -> dict[str, Any]:
+    """Return position, pose and the transform to the body as messages, by topic."""
+    stamp = _stamp(pose.time_ns)
+    w, *xyz = pose.q_local_from_b.tolist()
+    turned = fox.Quaternion(x=xyz[0], y=xyz[1], z=xyz[2], w=w)
+    x, y, z = pose.position.tolist()
+    place = fox.Vector3(x=x, y=y, z=z)
+    known = bool(np.isfinite(pose.sigma_l).all())
+    kinds = fox.LocationFixPositionCovarianceType
+    north, east, down = (pose.sigma_l**2).tolist() if known else (0.0, 0.0, 0.0)
+    fix = fox.LocationFix(
+        timestamp=stamp,
+        frame_id=BODY,
+        latitude=pose.lat_deg,
+        longitude=pose.lon_deg,
+        altitude=pose.height_m,
+        position_covariance=[east, 0, 0, 0, north, 0, 0, 0, down],
+        position_covariance_type=kinds.DiagonalKnown if known else kinds.Unknown,
+    )
+    transform = fox.FrameTransform(
+        timestamp=stamp, parent_frame_id=FRAME, child_frame_id=BODY, translation=place, rotation=turned
+    )
+    in_frame = fox.PoseInFrame(timestamp=stamp, frame_id=FRAME, pose=fox.Pose(position=place, orientation=turned))
+    return {"/position": fix, "/pose": in_frame, "/tf": transform}
+
+
+def grid_message(density: NDArray[np.float32], west_m: float, south_m: float, cell_m: float, time_ns: int) -> Any:
+    """Return points per square metre (rows from the south, columns from the west) in the frame ``local``."""
+    rows = np.ascontiguousarray(density, "<f4")
+    return fox.Grid(
+        timestamp=_stamp(time_ns),
+        frame_id=FRAME,
+        pose=_pose(fox.Vector3(x=west_m, y=south_m, z=0)),
+        column_count=rows.shape[1],
+        cell_size=fox.Vector2(x=cell_m, y=cell_m),
+        row_stride=4 * rows.shape[1],
+        cell_stride=4,
+        fields=[_field("points_per_m2", 0)],
+        data=rows.tobytes(),
+    )
+
+
+def log_message(text: str, *, well: bool, time_ns: int) -> Any:
+    """Return a sentence for the operator as a message."""
+    level = fox.LogLevel.Info if well else fox.LogLevel.Warning
+    return fox.Log(timestamp=_stamp(time_ns), level=level, message=text, name="swath live")
+
+
+def _pose(position: Any) -> Any:
+    return fox.Pose(position=position, orientation=fox.Quaternion(x=0, y=0, z=0, w=1))
+
+
+def _field(name: str, offset: int) -> Any:
+    return fox.PackedElementField(name=name, offset=offset, type=fox.PackedElementFieldNumericType.Float32)
 
 
 def _stamp(time_ns: int) -> Any:

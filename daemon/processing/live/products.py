@@ -21,8 +21,17 @@ from swath.daemon.errors import one_line
 from swath.daemon.processing.live.coverage import write_coverage
 from swath.daemon.processing.live.frame import LocalFrame, Maps
 from swath.daemon.processing.live.look import PROFILE, LastLook
-from swath.daemon.processing.live.mcap import NAME, LiveMcap, LivePose
+from swath.daemon.processing.live.mcap import (
+    NAME,
+    LiveMcap,
+    LivePose,
+    cloud_message,
+    grid_message,
+    log_message,
+    pose_messages,
+)
 from swath.daemon.processing.live.painting import COVERAGE, LiveMap
+from swath.daemon.processing.live.serve import LiveServer
 from swath.daemon.processing.live.unanswered import UnansweredPulses
 from swath.georef.arrays import Int64Array
 from swath.georef.compiled import jit_cached
@@ -34,6 +43,7 @@ from swath.georef.trajectory.trajectory import Trajectory
 POSE_NS = 100_000_000  # between two poses
 ROOM_AGAIN = 1.05  # free space, relative to where writing stopped, at which it begins again
 TILES_SHARE = 0.5  # of the quota: at most this much is for the map's tiles, the rest for live.mcap
+GRID_NS, GRID_CELLS = 10 * SECOND_NS, 256  # between two pictures of the coverage, and cells along a side of one
 FIRST_STRIDE = 16  # of the thinning, until the points of one second have been counted
 
 
@@ -116,6 +126,7 @@ class LiveProducts:
         reserve_bytes: int,
         about: str,
         gps_from_host: Callable[[int], int | None] = lambda host_ns: None,
+        server: LiveServer | None = None,
     ) -> None:
         """Prepare the folder.
 
@@ -126,6 +137,7 @@ class LiveProducts:
             reserve_bytes: the recorder's reserve of free space.
             about: describes the mapping frame for people.
             gps_from_host: gives GPS time of a host time; None: not known.
+            server: serves what live.mcap gets; None: nobody.
 
         Raises:
             OSError: the folder cannot be written to.
@@ -138,13 +150,14 @@ class LiveProducts:
         self.frame: LocalFrame | None = None
         self.map = LiveMap(folder, live.cell_m, int(TILES_SHARE * live.live_quota_mb * 1e6), gps_from_host)
         self.look = LastLook()
+        self.server = server
         self.unanswered: dict[str, UnansweredPulses] = {}
         self._trajectory: Trajectory | None = None
         self._placement: dict[str, Any] | None = None
         self._folder, self._live, self._mapping, self._about = folder, live, mapping, about
         self._thinning = Thinning(live.points_per_s)
         self._mcap: LiveMcap | None = None
-        self._pose_ns = 0
+        self._pose_ns = self._gridded_ns = 0
 
     def begin(self, trajectory: Trajectory | None) -> None:
         """Lay the local frame at the first known position; later calls change nothing.
@@ -171,7 +184,7 @@ class LiveProducts:
             cloud = self.frame.cloud_of(points, keep)
             self.look.take(name, points, keep, cloud)
             time_ns = unix_from_gps(int(points.time_ns[keep[0]]))
-            written = self._write(lambda mcap: mcap.add_cloud(f"/points/{name}", cloud, time_ns, log_time_ns))
+            written = self._publish({f"/points/{name}": cloud_message(cloud, time_ns)}, log_time_ns)
             self.shown += count * written
             self.unwritten += count * (not written)
 
@@ -200,7 +213,10 @@ class LiveProducts:
             q_local_from_b,
             trajectory.position_sigma_l[-1],
         )
-        self._write(lambda mcap: mcap.add_pose(pose, log_time_ns))
+        self._publish(pose_messages(pose), log_time_ns)
+        if log_time_ns >= self._gridded_ns + GRID_NS and self.map.grid.points:
+            self._gridded_ns = log_time_ns
+            self._publish_grid(log_time_ns)
 
     def save_map(self, latest: dict[str, Any], log_time_ns: int, *, last: bool = False) -> None:
         """Write the map's changed tiles, at most once a second of log time unless they are the ``last``."""
@@ -270,7 +286,31 @@ class LiveProducts:
         least_mb = self.room.least_bytes / 1e6
         self.trouble = f"free space is down to {least_mb:.0f} MB, twice the recorder's reserve; writing is suspended"
 
-    def _write(self, add: Any) -> bool:
+    def publish_status(self, text: str, *, well: bool, log_time_ns: int) -> None:
+        """Give a sentence for the operator, once there is a pose."""
+        if self._trajectory is not None:
+            time_ns = unix_from_gps(int(self._trajectory.time_ns[-1]))
+            self._publish({"/status": log_message(text, well=well, time_ns=time_ns)}, log_time_ns)
+
+    def _publish_grid(self, log_time_ns: int) -> None:
+        counts, west_m, north_m, cell_m = self.map.grid.image(GRID_CELLS)
+        assert self._trajectory is not None
+        time_ns = unix_from_gps(int(self._trajectory.time_ns[-1]))
+        density = (counts[::-1] / cell_m**2).astype(np.float32)
+        grid = grid_message(density, west_m, north_m - len(counts) * cell_m, cell_m, time_ns)
+        self._publish({"/coverage": grid}, log_time_ns)
+
+    def _publish(self, messages: dict[str, Any], log_time_ns: int) -> bool:
+        """Serve messages by topic, and write them to live.mcap if there is room; return True if all are written."""
+        written = self.frame is not None
+        for topic, message in messages.items():
+            schema, data = message.get_schema(), message.encode()
+            if self.server is not None:
+                self.server.send(topic, schema, data, log_time_ns)
+            written &= self._write(topic, schema, data, log_time_ns)
+        return written
+
+    def _write(self, topic: str, schema: Any, data: bytes, log_time_ns: int) -> bool:
         """Write to live.mcap, if there is a frame and room for it; return True if written."""
         if self.trouble or self.frame is None:
             return False
@@ -279,7 +319,7 @@ class LiveProducts:
                 quota_bytes = int(self._live.live_quota_mb * 1e6)
                 metadata = {key: json.dumps(value) for key, value in self.origin().items()}
                 self._mcap = LiveMcap(self._folder, quota_bytes, metadata)
-            written = bool(add(self._mcap))
+            written = self._mcap.add(topic, schema, data, log_time_ns)
         except OSError as error:
             self.trouble = f"{NAME}: {error.strerror or error}: nothing is written any more"
             return False

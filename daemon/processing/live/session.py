@@ -30,7 +30,8 @@ from swath.daemon.processing.live.follow import LiveFollower, LivePart, Skipped
 from swath.daemon.processing.live.lines import LINES, LiveLines
 from swath.daemon.processing.live.points import PointsFile
 from swath.daemon.processing.live.products import LiveProducts, Room
-from swath.daemon.processing.live.status import LiveStatus, sentence, write_status
+from swath.daemon.processing.live.serve import LiveServer
+from swath.daemon.processing.live.status import LiveStatus, is_well, sentence, write_status
 from swath.daemon.processing.live.tiles import FOLDER, Placement
 from swath.daemon.processing.live.unanswered import UnansweredPulses
 from swath.daemon.processing.pages.head import calibrations_words, crs_words
@@ -40,10 +41,12 @@ from swath.daemon.processing.setup.setup import Options, Setup, config_in_log
 from swath.drivers.scanner.srep.parser import SrepParser
 from swath.georef.arrays import StructArray
 from swath.georef.georeference import Georeferencer
+from swath.georef.timescales.gps_time import SECOND_NS
 from swath.georef.trajectory.trajectory import Trajectory
 
 POLL_S = 0.05
 SAVE_NS = 100_000_000  # of the log's time, between two looks for what has to be written
+PUBLISH_NS = 2 * SECOND_NS
 STATUS_S = 1.0
 PRINT_WAIT_S = 8.0  # for the page at the end; the service has to end in time
 COVERAGE_S = 10.0
@@ -96,6 +99,7 @@ class LiveSession:
         *,
         beside_recorder: bool = False,
         accept_verdict: bool = False,
+        server: LiveServer | None = None,
     ) -> None:
         """Prepare a session.
 
@@ -107,7 +111,7 @@ class LiveSession:
         self.info = info
         source = "navigated" if setup.sources.ins_source is None else "ins"
         self.verdict = verdict_entry(list(calibration_verdicts(setup, source)), accepted=accept_verdict)
-        self.now_ns = self._saved_ns = 0
+        self.now_ns = self._saved_ns = self._published_ns = 0
         self._stream = setup.live_stream(info)
         self._path = _SeenPath(self._stream.path)
         self._stream.path = self._path
@@ -131,7 +135,7 @@ class LiveSession:
             )
         reserve_bytes = int(setup.config.session.reserve_mb * 1e6)
         about = setup.options.crs or setup.config.output.crs or "EPSG:4978 (no [output] crs)"
-        self.products = LiveProducts(folder, live, setup.mapping, reserve_bytes, about, self._gps_from_host)
+        self.products = LiveProducts(folder, live, setup.mapping, reserve_bytes, about, self._gps_from_host, server)
         self.status = LiveStatus(setup, self._stream, self.products, self._feed.fixes)
         self.log_state: Told = {}
         self.folder, self.printer = folder, PagePrinter(folder)
@@ -167,6 +171,7 @@ class LiveSession:
             self._saved_ns = self.now_ns
             self.products.save_map({"session_id": self.info.session_id}, self.now_ns)
             self._save_lines()
+            self._tell()
             if self.landing.is_due(self.now_ns):
                 self._save_verdict(live=live)
 
@@ -212,6 +217,15 @@ class LiveSession:
             return self.landing.look((grid.cell_m, grid.take_unseen()), self.lines.watch, self.lines.plan, places)
         except ValueError:  # the area lies beyond the mapping frame
             return None
+
+    def _tell(self) -> None:
+        """Give the status in a sentence, every other second of the log's time."""
+        if self.now_ns < self._published_ns + PUBLISH_NS:
+            return
+        passed_s, self._published_ns = (self.now_ns - self._published_ns) / SECOND_NS, self.now_ns
+        found = {"state": "following", "session_id": self.info.session_id, "verdict": self.verdict}
+        found |= self.status.brief(self.now_ns, passed_s) | self.lines.plain_status()
+        self.products.publish_status(one_line(sentence(found)), well=is_well(found), log_time_ns=self.now_ns)
 
     def _save_lines(self, *, last: bool = False) -> None:
         """Write the state of the lines, unless free space is low."""
@@ -275,6 +289,7 @@ class Live:
         tell: called with the status each second, with its ``sentence``.
         prepare: called with the recording's setup before the first of its messages is taken, to compile what it needs.
         accept_verdict: accept an unusable calibration.
+        server: serves what live.mcap gets; None: nobody.
     """
 
     def __init__(
@@ -287,8 +302,9 @@ class Live:
         points: Path | None = None,
         prepare: Callable[[Setup], None] | None = None,
         accept_verdict: bool = False,
+        server: LiveServer | None = None,
     ) -> None:
-        self._accept_verdict = accept_verdict
+        self._accept_verdict, self._server = accept_verdict, server
         self._directory, self._live, self._tell, self._points = directory, live, tell, points
         self._prepare = prepare
         self._follower = LiveFollower(directory, from_start=from_start)
@@ -347,6 +363,7 @@ class Live:
             self._points,
             beside_recorder=True,
             accept_verdict=self._accept_verdict,
+            server=self._server,
         )
         held, self._held = self._held, []
         for batch in held:
@@ -418,11 +435,19 @@ def made_session(
     *,
     beside_recorder: bool = False,
     accept_verdict: bool = False,
+    server: LiveServer | None = None,
 ) -> LiveSession:
     """Return a session; refuse with `UserError` a folder that cannot be written to."""
     try:
         session = LiveSession(
-            setup, info, folder, live, points, beside_recorder=beside_recorder, accept_verdict=accept_verdict
+            setup,
+            info,
+            folder,
+            live,
+            points,
+            beside_recorder=beside_recorder,
+            accept_verdict=accept_verdict,
+            server=server,
         )
         session.look_for_room()
         return session
@@ -441,6 +466,7 @@ def replay(
     batches: Iterable[LogBatch] | None = None,
     *,
     accept_verdict: bool = False,
+    server: LiveServer | None = None,
 ) -> Told:
     """Run a session over a finished log at full speed; return the last status, which is also written to ``folder``.
 
@@ -450,11 +476,12 @@ def replay(
         tell: called with the log time reached.
         batches: batches instead of the session's own, cut differently.
         accept_verdict: accept an unusable calibration.
+        server: serves what live.mcap gets; None: nobody.
 
     Raises:
         UserError: no file can be written.
     """
-    run = made_session(setup, session.info, folder, live, points, accept_verdict=accept_verdict)
+    run = made_session(setup, session.info, folder, live, points, accept_verdict=accept_verdict, server=server)
     try:
         for batch in session.batches() if batches is None else batches:
             run.take(batch, live=False)

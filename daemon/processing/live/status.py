@@ -82,6 +82,7 @@ class LiveStatus:
         self._sources: dict[str, str | None] = {}  # by topic
         self._offsets: dict[str, tuple[int, int | None]] = {}  # by scanner: host time, and GPS time minus host time
         self._points_before: Counter[str] = Counter()
+        self._brief_before: Counter[str] = Counter()
         self._fates_before: dict[str, Counter[str]] = {}
         self._refused_before: dict[str, Counter[str]] = {}
         self._told_s = time.monotonic()
@@ -166,6 +167,20 @@ class LiveStatus:
                 "damaged_chunks": follower.damaged + (follower.part.damaged if follower.part else 0),
             }
         return found
+
+    def brief(self, now_ns: int, passed_s: float) -> dict[str, Any]:
+        """Return what `sentence` tells, of the log's time only: ``passed_s`` have passed since the last call."""
+        points, names = self._products.points, self._stream.scanners
+        rates = {name: round((points[name] - self._brief_before[name]) / max(passed_s, 1e-3)) for name in names}
+        self._brief_before = points.copy()
+        return {
+            "points": {name: points[name] for name in names},
+            "points_per_s": rates,
+            "fates": {name: self._fates(name) for name in names},
+            "latency_s": {},
+            "time": self._clock_states(now_ns),
+            "trouble": self._products.trouble,
+        }
 
     def _fates(self, name: str) -> dict[str, int]:
         return {FATE_NAMES[fate]: count for fate, count in self._stream.fates(name).items()}

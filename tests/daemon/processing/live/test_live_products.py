@@ -5,16 +5,18 @@ from __future__ import annotations
 import io
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from mcap.reader import make_reader
+from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from swath.daemon.config.tables import LiveConfig
 from swath.daemon.processing.live.grid import CellGrid
-from swath.daemon.processing.live.mcap import CLOUD_DTYPE, END_BYTES, NAME, PREVIOUS, LiveMcap
+from swath.daemon.processing.live.mcap import CLOUD_DTYPE, END_BYTES, NAME, PREVIOUS, LiveMcap, cloud_message
 from swath.daemon.processing.live.painting import HERE, IMAGE_CELLS, METRES, picture
 from swath.daemon.processing.live.products import LiveProducts, Room, Thinning
 from swath.daemon.processing.live.tiles import SIDE
@@ -32,6 +34,12 @@ from tests.daemon.processing.live.builders import (
 )
 
 pytestmark = pytest.mark.xdist_group("kernels")
+
+
+def added(writer: LiveMcap, cloud: NDArray[Any]) -> bool:
+    """Add a cloud to a file; return whether it was written."""
+    message = cloud_message(cloud, SECOND_NS)
+    return writer.add("/points/left", message.get_schema(), message.encode(), SECOND_NS)
 
 
 # ---------------------------------------------------------------------- protobuf, by the schema in the file
@@ -55,6 +63,7 @@ class TestMcap:
             "/position": "foxglove.LocationFix",
             "/pose": "foxglove.PoseInFrame",
             "/tf": "foxglove.FrameTransform",
+            "/coverage": "foxglove.Grid",
         }
         [cloud] = found["/points/left"]
         assert (cloud["frame_id"], cloud["point_stride"], cloud["log_time"]) == ("local", 16, 77 * SECOND_NS)
@@ -97,18 +106,18 @@ class TestMcap:
         for _ in range(2):
             writer = LiveMcap(tmp_path, quota, {})
             written = 0
-            while writer.add_cloud("/points/left", cloud, SECOND_NS, SECOND_NS) and written < 10:
+            while added(writer, cloud) and written < 10:
                 written += 1
             writer.close()
         assert (tmp_path / PREVIOUS).exists()
         writer = LiveMcap(tmp_path, quota, {})
-        added = sum(writer.add_cloud("/points/left", cloud, SECOND_NS, SECOND_NS) for _ in range(200))
+        count = sum(added(writer, cloud) for _ in range(200))
         assert writer.is_full
-        assert not writer.add_cloud("/points/left", cloud, SECOND_NS, SECOND_NS)
+        assert not added(writer, cloud)
         writer.close()
         assert not (tmp_path / PREVIOUS).exists()
         assert 0.5 * quota < (tmp_path / NAME).stat().st_size <= quota
-        assert len(read_back(tmp_path / NAME)["/points/left"]) == added < 200
+        assert len(read_back(tmp_path / NAME)["/points/left"]) == count < 200
         assert quota > 2 * END_BYTES
 
     def test_messages_that_are_not_written_are_counted(self, tmp_path: Path) -> None:
