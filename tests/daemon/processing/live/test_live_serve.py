@@ -47,7 +47,7 @@ def connected(server: LiveServer) -> ClientConnection:
 
 
 def subscribed(client: ClientConnection, wanted: set[str]) -> dict[int, dict[str, Any]]:
-    """Subscribe to topics once they are announced; return the channels by the subscription's number."""
+    """Return the channels of topics by the subscription's number; they are subscribed to once they are announced."""
     found: dict[int, dict[str, Any]] = {}
     while {channel["topic"] for channel in found.values()} != wanted:
         told = client.recv(WAIT_S)
