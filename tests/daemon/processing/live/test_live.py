@@ -179,11 +179,9 @@ class TestPoints:
         for batch in session.batches():
             if run.landing.facts.marked_ns is None and run.now_ns > marked_ns:
                 run.landing.facts.event(run.now_ns, {"code": "mark", "text": "landing: You can go home"})
-                run.take(batch, live=True)
-                verdict = json.loads((tmp_path / "verdict.json").read_text())
-                continue
             run.take(batch, live=True)
-        assert verdict["log_time_ns"] == pytest.approx(marked_ns, abs=1e9)
+        verdict = json.loads((tmp_path / "verdict.json").read_text())
+        assert marked_ns <= verdict["log_time_ns"] < marked_ns + 2_000_000_000
         assert verdict["state"] == "again"  # whatever the mark says
         run.close(live=True)
         assert (tmp_path / "landing.pdf").read_bytes().startswith(b"%PDF-")
