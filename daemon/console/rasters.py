@@ -195,7 +195,9 @@ class MbTiles(Tiled):
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self._path = path
-        self._base = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False)
+        # a database with a write-ahead log needs files beside it, which the service may not make: sqlite.org/wal.html
+        how = "mode=ro" if os.access(path.resolve().parent, os.W_OK) else "immutable=1"
+        self._base = sqlite3.connect(f"{path.resolve().as_uri()}?{how}", uri=True, check_same_thread=False)
 
     def check(self) -> None:
         """Read what the map says of itself; refuse what is no map of pictures with `UserError`."""

@@ -256,6 +256,22 @@ def test_tiles_that_are_damaged_leave_holes_and_are_told(
     assert "cannot be read" in background.plain()["trouble"]
 
 
+def test_tiles_are_read_from_a_folder_that_may_not_be_written_to(
+    tmp_path: Path, opened: Callable[[Path], Raster], frame: LocalFrame, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A database with a write-ahead log, as some programs leave it; root may write everywhere, so that it is told."""
+    path = tmp_path / "map"
+    write_mbtiles(path, frame)
+    base = sqlite3.connect(path)
+    base.execute("PRAGMA journal_mode = wal")
+    base.close()
+    monkeypatch.setattr("swath.daemon.console.rasters.os.access", lambda *_: False)
+    before = sorted(tmp_path.iterdir())
+    place = placed(frame)
+    assert Background(opened(path), lambda: place).picture(0, 0, 0) is not None
+    assert sorted(tmp_path.iterdir()) == before  # no log of SQLite beside it
+
+
 def test_an_attribution_becomes_text() -> None:
     assert as_text('<a href="https://e.x/">© A&amp;B</a>\n<script>alert(1)</script>') == "© A&B alert(1)"
     assert len(as_text("x" * 5000)) == 200
