@@ -301,8 +301,8 @@ def console(service: Machine) -> Iterator[str]:
     """Run with the console's service; return a command that prints the first snapshot that it feeds to a page."""
     failed = "{ journalctl --no-pager -b -u swath-console; exit 1; }"
     service.told(f"systemctl start swath-console || {failed}", COMES_BACK_S)
-    # the feed never ends: its first event is enough
-    yield f"{{ curl -sN -m 60 {CONSOLE}/feed || true; }} | grep -m 1 ^data:"
+    # the feed never ends: its first snapshot is enough
+    yield f"{{ curl -sN -m 60 {CONSOLE}/feed || true; }} | grep -m 1 now_ms"
     service.told("systemctl stop swath-console")
 
 
