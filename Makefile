@@ -26,7 +26,7 @@ export PIP_ROOT_USER_ACTION := ignore
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
 
-demo: $(VENV)/.flies ## record real recordings and a simulated flight over real wires, make points and a page (about 3 min)
+demo: $(VENV)/.flies ## record real recordings and a simulated flight over real wires, show the console, make points and a page (about 3 min)
 	@$(BIN)/python -m demo
 
 test: $(VENV)/.tests $(VENV)/.tools ## install what they need, then run style, types, import rules and tests
@@ -118,7 +118,7 @@ $(VENV)/bin/python:
 	@sh systemd/setup.sh venv "$(PYTHON)" "$(VENV)"
 
 $(VENV)/.flies: pyproject.toml | $(VENV)/bin/python
-	@sh systemd/setup.sh pip "$(VENV)" '.[sim,process]'
+	@sh systemd/setup.sh pip "$(VENV)" '.[sim,process,live,console]'
 	@touch $@
 
 $(VENV)/.tests: pyproject.toml | $(VENV)/bin/python

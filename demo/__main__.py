@@ -14,19 +14,22 @@ from pathlib import Path
 from rich.console import Console
 
 from demo import flight, points, recordings
+from demo.onlooking import shown
 from demo.proof import perform
 
 
 def demonstrate(console: Console, folder: Path, seconds: float, flight_seconds: float) -> Path | None:
     """Play the recordings and the flight, each in a folder of its own, and make points of the flight.
 
-    The flight is made, and loops are compiled, while the recordings play. Returns the page of the points; None if
-    anything is not as it should be.
+    The flight is made, and loops are compiled, while the recordings play. The console shows the flight.
+    Returns the page of the points; None if anything is not as it should be.
     """
     ahead, compiling = flight.take_off(flight_seconds), points.compile_beside()
     try:
         recorded = perform(console, folder / "recordings", recordings.prepare(folder / "recordings", seconds))
-        flown = perform(console, folder / "flight", flight.prepare(console, folder / "flight", ahead))
+        show = flight.prepare(console, folder / "flight", ahead)
+        with shown(console, folder / "flight", compiling):
+            flown = perform(console, folder / "flight", show)
         page = points.make_points(console, folder / "flight", compiling)
     finally:
         ahead.close()

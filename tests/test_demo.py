@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -58,6 +59,8 @@ def test_the_demonstration_passes_and_shows_its_results(played: tuple[str, Path]
     assert "demonstration passed" in text
     assert text.count("every unit is accounted for") == 2
     assert text.count(" same ") == 5 + 4
+    assert "http://127.0.0.1:" in text
+    assert json.loads((folder / "flight/logs/live/lines.json").read_text())["plan"] == "plan.toml"
     assert text.count("LOCKED") == 4  # receiver and pulse in both parts
     for part, sources in SOURCES.items():
         content = read_log(folder / part / "logs")
