@@ -122,10 +122,16 @@ class Line:
 
 
 def plain_line(line: Line, *, is_flying: bool) -> dict[str, Any]:
-    """Return the state of a line as plain values, which are not to be changed."""
+    """Return the state of a line as plain values, which are not to be changed.
+
+    The end of a line that is being flown is still to come, so that it is not missed.
+    """
     if line.told is None:
         line.told = _plain(line)
-    return line.told | {"state": "flying"} if is_flying else line.told
+    if not is_flying:
+        return line.told
+    reasons = [one for one in line.told["reasons"] if one["code"] != "early_end"]
+    return line.told | {"state": "flying", "reasons": reasons}
 
 
 def _plain(line: Line) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pyproj import Geod
 
-from swath.daemon.processing.flightplan.lines import parsed_overrule
+from swath.daemon.processing.flightplan.lines import parsed_overrule, plain_line
 from swath.daemon.processing.flightplan.moments import STEP_NS, Moments, empty_moments
 from swath.daemon.processing.flightplan.watch import LineWatch
 from tests.daemon.processing.flightplan.builders import (
@@ -89,6 +89,8 @@ def test_a_line_may_be_flown_again_and_in_pieces() -> None:
     assert (reason["code"], reason["grave"]) == ("early_end", True)
     assert reason["value"] == pytest.approx(950.0 - 60.0, abs=20.0)  # the laser goes on for a second
     assert watched.plain()["lines"][1]["flown_to_m"] == pytest.approx(1110.0, abs=20.0)
+    flying = plain_line(watched.lines[1], is_flying=True)
+    assert (flying["state"], flying["reasons"]) == ("flying", [])
 
 
 def test_overlap_is_the_fault_of_the_line_that_left_its_plan() -> None:
