@@ -9,6 +9,7 @@ import re
 from collections.abc import AsyncIterator
 from importlib import resources
 from pathlib import Path
+from typing import Any
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
@@ -48,6 +49,7 @@ class Feed:
         self._changed = asyncio.Condition()
         self._loop: asyncio.AbstractEventLoop | None = None
         self.readers = 0
+        self._made: tuple[dict[str, Any] | None, bytes] = (None, b"")
 
     def begin(self) -> None:
         """Bind to the running loop."""
@@ -63,6 +65,12 @@ class Feed:
         async with self._changed:
             self._changed.notify_all()
 
+    def _encoded(self, latest: dict[str, Any]) -> bytes:
+        """Return a snapshot as a page reads it, made once for all pages."""
+        if self._made[0] is not latest:
+            self._made = latest, f"data: {json.dumps(latest, separators=(',', ':'))}\n\n".encode()
+        return self._made[1]
+
     async def lines(self, role: str) -> AsyncIterator[bytes]:
         """Yield server-sent events: the role, then the newest snapshot and how to steer when they have changed."""
         self.readers += 1
@@ -74,7 +82,7 @@ class Feed:
                 if steering is not shown[1]:
                     yield f"event: steering\ndata: {json.dumps(steering, separators=(',', ':'))}\n\n".encode()
                 if latest is not shown[0]:
-                    yield f"data: {json.dumps(latest, separators=(',', ':'))}\n\n".encode()
+                    yield self._encoded(latest)
                 shown = latest, steering
                 try:
                     async with self._changed:
