@@ -12,13 +12,13 @@ from benchmarks import (
     georef,
     georef_log,
     listen,
-    live_extra,
     navigation,
     navigation_honesty,
     navigation_seeds,
     planes,
     raycast,
 )
+from benchmarks.inflight import extra
 
 decode.main()
 georef.main()
@@ -32,4 +32,4 @@ planes.main()
 clock.main()
 acquire.main()
 listen.main()
-live_extra.main()
+extra.main()

@@ -1,6 +1,6 @@
 """Measure what the operator's console costs at the end of a long flight, with ten pages open.
 
-python -m benchmarks.console [--seconds 20] [--clients 10] [--tiles 1600]
+python -m benchmarks.inflight.console [--seconds 20] [--clients 10] [--tiles 1600]
 
 A folder of live's files is made up: 1,600 tiles of 128 by 128 cells (104 km² in cells of 2 m), 200 lines. Then eight
 tiles, the lines and the status change each second, as live does it, while clients read the feed as pages do and ask

@@ -1,6 +1,6 @@
 """Measure what the map, the last moments and the lines cost the live georeferencer, beside all else that it does.
 
-python -m benchmarks.live_extra [--log FOLDER] [--repeats 5]
+python -m benchmarks.inflight.extra [--log FOLDER] [--repeats 5]
 
 Replays a log (default: the preset ``small``, 50,000 pulses a second, with its plan) and takes this process's CPU time
 within the functions of the map and of the lines, without the time that taking it costs. As both are taken in one run,
