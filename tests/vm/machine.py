@@ -31,8 +31,6 @@ DCD_SHIM = CACHE / "dcd_shim.so"
 BOOT_S = 120.0  # twenty times what it takes on an idle machine
 FIRST_WORD_S = 60.0  # from power on to VM-STAGE1, likewise
 POWERED_ON = 3  # times that it is powered on at most, if it stands still before that
-# two emulated machines of two processors wait for each other's threads on a computer of two
-CPUS = "1" if "PYTEST_XDIST_WORKER" in os.environ else "2"
 TIMED_OUT = 124
 NO_STATUS = 125
 SERVE = """\
@@ -254,7 +252,7 @@ def start(
         arguments += ["-fsdev", f"local,id={tag},path={folder},security_model=none{more}"]
         arguments += ["-device", f"virtio-9p-pci,fsdev={tag},mount_tag={tag}"]
     board = "q35,usb=off,sata=off,smbus=off"
-    computer = ["-M", board, "-smp", CPUS, "-m", str(memory_mb), "-display", "none", "-serial", "stdio"]
+    computer = ["-M", board, "-smp", "2", "-m", str(memory_mb), "-display", "none", "-serial", "stdio"]
     fixed = ["-nodefaults", "-no-user-config", "-no-reboot", "-device", "virtio-rng-pci"]
     # setpriv ends the machine if the test run is killed
     line = [
