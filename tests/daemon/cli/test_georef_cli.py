@@ -114,7 +114,7 @@ class TestProducts:
         config = tmp_path / "plumb.toml"
         text = (flown.folder / "swath.toml").read_text()
         config.write_text(f'{text}\n[attitude]\nvertical = "plumb"\nxi_arcsec = 100.0\neta_arcsec = -70.0\n')
-        for name in ("main.dbc", "left.nominal.toml"):
+        for name in ("main.dbc", "left.nominal.toml", "plan.toml"):
             (tmp_path / name).write_bytes((flown.folder / name).read_bytes())
         assert run_app(flown.arguments(tmp_path / "out", "--config", str(config), "--no-sigma")) == 0
         las, truth = laspy.read(next((tmp_path / "out").glob("*_strip01.laz"))), flown.truth
