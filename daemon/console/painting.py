@@ -78,7 +78,7 @@ class Painter:
 
     @property
     def placement(self) -> Placement | None:
-        """Where the map lies on the earth, the same object while it stays there; None: not known."""
+        """Place of the map on the earth, the same object while it stays there; None: not known."""
         said = self._reader.index.get("placement")
         if said != self._placed[0]:
             self._placed = said, Placement.of(self._reader.index)

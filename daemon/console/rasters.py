@@ -12,6 +12,7 @@ import math
 import os
 import sqlite3
 import warnings
+from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterator
 from html.parser import HTMLParser
@@ -103,7 +104,7 @@ def _refused(path: Path, why: str) -> UserError:
     return UserError(one_line(f"[console] background: {path}: {why}"), ExitCode.USAGE)
 
 
-class Tiled:
+class Tiled(ABC):
     """A map in square tiles of web Mercator.
 
     Attributes:
@@ -119,9 +120,9 @@ class Tiled:
         self._kept: OrderedDict[tuple[int, int, int], Picture | None] = OrderedDict()
         self._bytes = 0
 
+    @abstractmethod
     def encoded(self, zoom: int, x: int, y: int) -> bytes | None:
         """Return a tile's file, counted from the north-west; None: there is none."""
-        raise NotImplementedError
 
     def begin(self, first: bytes) -> None:
         """Take side and kind from one of the tiles.

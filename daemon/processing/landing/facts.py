@@ -114,7 +114,7 @@ class Heard:
 
 @dataclass
 class LogFacts:
-    """What the log says of a flight.
+    """Collects what the log says of a flight.
 
     Args:
         begun_ns: host time at which the recording began.
@@ -227,7 +227,7 @@ class LogFacts:
 
     @property
     def source_troubles(self) -> list[str]:
-        """What is wrong now with sources, in words."""
+        """Present troubles of sources, in words."""
         found = []
         for source, status in sorted(self.statuses.items()):
             try:

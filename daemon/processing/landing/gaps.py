@@ -23,7 +23,7 @@ BESIDE = ndimage.generate_binary_structure(2, 2)  # cells that touch at a corner
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ground:
-    """What lies where on the ground; rows run from south to north.
+    """Holds cells of the ground with and without points; rows run from south to north.
 
     Attributes:
         west_m, south_m: edges, in the frame ``local``.

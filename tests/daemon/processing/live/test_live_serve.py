@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
@@ -117,8 +118,10 @@ def test_a_client_that_never_reads_holds_nothing_up(tmp_path: Path) -> None:
     fly(products, 0)
     with connected(server) as client:
         subscribed(client, {"/points/left"})
+        before = psutil.Process().memory_info().rss
         for _ in range(400):
-            products.server.send("/points/left", None, bytes(1_000_000), SECOND_NS)  # type: ignore[union-attr]
+            server.send("/points/left", None, bytes(1_000_000), SECOND_NS)
+        assert psutil.Process().memory_info().rss - before < 100e6
     products.close()
     server.close()
 
