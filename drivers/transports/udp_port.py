@@ -215,12 +215,14 @@ class SharedPort:
     """A UDP port with a transport for each configured sender, in one process; whichever thread reads serves all.
 
     Datagrams that the kernel dropped have no known sender, and those of other senders belong to no transport: both are
-    counted once, at the transport that opened first.
+    counted once, at the transport that opened first; other senders' there even after it has left, so that one stranger
+    is told once. What a transport's own sender sends after it has left belongs to nobody.
     """
 
     def __init__(self, spec: TransportSpec) -> None:
         self.socket = UdpPort(spec)
         self._sharers: dict[str, Sharer] = {}
+        self._counters: dict[str, TransportCounters] = {}  # of all that ever joined, in this order
         self._lock = threading.Lock()
         self._dropped = 0
 
@@ -234,6 +236,7 @@ class SharedPort:
                 raise TransportError(f"{spec.text}: port {spec.port} is in use by this program itself")
             self.socket.ask_buffer(int(spec.options.get("buffer_mb", DEFAULT_BUFFER_MB)) << 20)
             sharer = self._sharers[source] = Sharer(self, source, counters)
+            self._counters[source] = counters
         return sharer
 
     def remove(self, sharer: Sharer) -> bool:
@@ -257,7 +260,8 @@ class SharedPort:
         sender = "" if block.peer is None else block.peer[0]
         owner = self._sharers.get(sender)
         if owner is None:
-            next(iter(self._sharers.values())).counters.refuse(sender, len(block.units))
+            if sender not in self._counters:
+                next(iter(self._counters.values())).refuse(sender, len(block.units))
             return
         owner.put(block)
         if owner is not reading:

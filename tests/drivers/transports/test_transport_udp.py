@@ -321,6 +321,23 @@ def test_drops_of_a_shared_port_are_counted_once() -> None:
         right.close()
 
 
+def test_what_comes_after_a_transport_left_a_shared_port_is_not_told_as_a_strangers() -> None:
+    port = free_port()
+    left, right = (transport(f"?source=127.0.0.{head}", port=port) for head in (2, 3))
+    left.open()
+    right.open()
+    with sender_at("127.0.0.2") as one, sender_at("127.0.0.3") as two, sender_at("127.0.0.4") as stranger:
+        stranger.sendto(b"early", ("127.0.0.1", port))
+        assert right.receive(0.2) == []
+        left.close()
+        for sender in (one, stranger, two):
+            sender.sendto(b"late", ("127.0.0.1", port))
+        assert [block.peer and block.peer[0] for block in right.receive(1.0)] == ["127.0.0.3"]
+    assert right.poll_counters().refused == 0
+    assert left.poll_counters().refused_text() == "127.0.0.4 (2)"
+    right.close()
+
+
 def test_one_sender_has_one_transport() -> None:
     port = free_port()
     first, second = (transport("?source=127.0.0.2", port=port) for _ in range(2))
