@@ -37,6 +37,7 @@ class Pass:
         rows: moments so far.
         begin_ns: GPS time of its first pose.
         left_ns: GPS time when the aircraft left the line; None: it has not.
+        is_settled: the aircraft has left the line, and all its moments have come.
     """
 
     number: int
@@ -102,15 +103,26 @@ class Line:
         return is_level and (seconds >= LEAST_PASS_S or flown_m >= LEAST_PASS_SHARE * self.length_m)
 
     @property
+    def is_open(self) -> bool:
+        """True while it is being flown, or was left so shortly ago that moments of it are still to come."""
+        return any(not one.is_settled for one in self.passes)
+
+    @property
     def reasons(self) -> list[Reason]:
-        """All reasons, the gravest first."""
-        found = [] if self.verdict is None else list(self.verdict.reasons)
-        found += [self.overlap] if self.overlap is not None and self.verdict is not None else []
+        """All reasons, the gravest first; the end is not missed while moments of a judged pass are still to come."""
+        if self.verdict is None:
+            return []
+        found = [reason for reason in self.verdict.reasons if reason.code != "early_end" or not self._grows]
+        found += [self.overlap] if self.overlap is not None else []
         return sorted(found, key=lambda reason: not reason.is_grave)
 
     @property
+    def _grows(self) -> bool:
+        return any(not one.is_settled and one.number in self.judged for one in self.passes)
+
+    @property
     def state(self) -> str:
-        """State of a line that is not being flown: ``planned``, ``good``, ``remarks`` or ``again``."""
+        """State of a line that is not open: ``planned``, ``good``, ``remarks`` or ``again``."""
         if self.overrule is not None:
             if self.overrule.verdict == "again":
                 return "again"
@@ -121,17 +133,11 @@ class Line:
         return "again" if any(one.is_grave for one in reasons) else "remarks" if reasons else "good"
 
 
-def plain_line(line: Line, *, is_flying: bool) -> dict[str, Any]:
-    """Return the state of a line as plain values, which are not to be changed.
-
-    The end of a line that is being flown is still to come, so that it is not missed.
-    """
+def plain_line(line: Line) -> dict[str, Any]:
+    """Return the state of a line as plain values, which are not to be changed."""
     if line.told is None:
         line.told = _plain(line)
-    if not is_flying:
-        return line.told
-    reasons = [one for one in line.told["reasons"] if one["code"] != "early_end"]
-    return line.told | {"state": "flying", "reasons": reasons}
+    return line.told | {"state": "flying"} if line.is_open else line.told
 
 
 def _plain(line: Line) -> dict[str, Any]:

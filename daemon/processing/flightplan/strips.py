@@ -124,15 +124,15 @@ class StripWatch:
         rows = join_moments([self._rows, *self._new])
         if len(rows):
             self._look(int(rows["gps_ns"][-1]))
+        if self._is_flying:
+            self.lines[-1].passes[0].is_settled = True
         self._is_flying = False
 
     def plain(self) -> dict[str, Any]:
         """Return the state of all strips as plain values, without the geometry."""
         for line in self.lines:
             line.refresh()
-        last = len(self.lines) - 1
-        lines = [plain_line(line, is_flying=self._is_flying and at == last) for at, line in enumerate(self.lines)]
-        return {"plan": None, "lines": lines} | self.plain_steering()
+        return {"plan": None, "lines": [plain_line(line) for line in self.lines]} | self.plain_steering()
 
     def plain_steering(self) -> dict[str, Any]:
         """Return the strip that is flown; there is nothing to steer to."""

@@ -24,7 +24,6 @@ from swath.daemon.processing.flightplan.geometry import (
 )
 from swath.daemon.processing.flightplan.judge import Limits
 from swath.daemon.processing.flightplan.lines import Line, Overrule, Pass, parsed_overrule, plain_line
-from swath.daemon.processing.flightplan.moments import SETTLE_NS
 from swath.daemon.processing.flightplan.overlap import overlap_reasons
 from swath.daemon.processing.flightplan.plan import FlightPlan
 from swath.georef.arrays import BoolArray, FloatArray, StructArray
@@ -315,17 +314,22 @@ class LineWatch:
                 one.rows.append(rows[start:end])
                 self.lines[one.line].is_new = True
         newest_ns = int(rows["gps_ns"][-1])
-        for number, one in list(self._passes.items()):
-            if one.left_ns is not None and newest_ns > one.left_ns + AWAY_NS + SETTLE_NS:
-                one.is_settled = True
-                del self._passes[number]
+        for one in list(self._passes.values()):
+            if one.left_ns is not None and newest_ns > one.left_ns:
+                self._settle(one)
+
+    def _settle(self, one: Pass) -> None:
+        """Note that all moments of a pass have come; it cannot go on either, as moments are older than `AWAY_NS`."""
+        one.is_settled = self.lines[one.line].is_new = True
+        del self._passes[one.number]
 
     def close(self) -> None:
-        """End the pass that is being flown: no more moments come."""
-        if self.current is not None:
-            rows = self.current.moments()
-            self.current.left_ns = int(rows["gps_ns"][-1]) if len(rows) else self.current.begin_ns
-            self.lines[self.current.line].is_new = True
+        """End all passes: no more moments come."""
+        for one in list(self._passes.values()):
+            if one.left_ns is None:
+                rows = one.moments()
+                one.left_ns = int(rows["gps_ns"][-1]) if len(rows) else one.begin_ns
+            self._settle(one)
         self.current = self.steering = None
 
     def overrule(self, text: str, time_ns: int) -> bool:
@@ -352,8 +356,7 @@ class LineWatch:
     def plain(self) -> dict[str, Any]:
         """Return the state of all lines as plain values, without the geometry."""
         self.refresh()
-        current = None if self.current is None else self.current.line
-        lines = [plain_line(line, is_flying=place == current) for place, line in enumerate(self.lines)]
+        lines = [plain_line(line) for line in self.lines]
         return {"plan": self.plan.name, "lines": lines} | self.plain_steering()
 
     def plain_steering(self) -> dict[str, Any]:

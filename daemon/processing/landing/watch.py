@@ -160,8 +160,7 @@ def _lines_at(watch: LineWatch, place_deg: FloatArray, sample_deg: FloatArray) -
     ]
     flown = [number for number, verdict in enumerate(verdicts) if verdict is not None]
     distance_m = here.distance_m[0].copy()
-    current = None if watch.current is None else watch.current.line
-    due = np.array([n == current or line.state in ("planned", "again") for n, line in enumerate(watch.lines)])
+    due = np.array([line.is_open or line.state in ("planned", "again") for line in watch.lines])
     half_m = _half_m([verdict for verdict in verdicts if verdict is not None])
     reached = (at.along_m >= 0.0) & (at.along_m <= watch.geometry.length_m) & (np.abs(at.across_m) <= half_m)
     if float((reached & due).any(axis=1).mean()) >= UNDER_SHARE:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -193,8 +194,18 @@ def _spoil(
         rows["returns"][mask], rows["empty"][mask], rows["silent"][mask] = 0, 1, 0
 
 
-def watch(flight: Flight, rows: StructArray, *, planned: bool = True, step: int = 20) -> LineWatch | StripWatch:
-    """Feed a watch, poses at once and returns 3 s later, as live does; ``step`` poses at a time."""
+def watch(
+    flight: Flight,
+    rows: StructArray,
+    *,
+    planned: bool = True,
+    step: int = 20,
+    seen: Callable[[dict[str, Any]], None] | None = None,
+) -> LineWatch | StripWatch:
+    """Feed a watch, poses at once and returns 3 s later, as live does; ``step`` poses at a time.
+
+    ``seen`` gets what an operator sees after each step.
+    """
     watched = LineWatch(flight.plan, flight.config) if planned else StripWatch(flight.config)
     join = Moments([])
     columns = ("returns", "silent", "empty", "untimed", "left_m", "right_m", "above_m")
@@ -205,6 +216,8 @@ def watch(flight: Flight, rows: StructArray, *, planned: bool = True, step: int 
             poses[column] = empty_moments(1)[column]
         join.add_poses(watched.poses(poses))
         _settle(watched, join.settled(), rows, first_ns, columns)
+        if seen is not None:
+            seen(watched.plain())
     _settle(watched, join.settled(last=True), rows, first_ns, columns)
     watched.close()
     return watched
