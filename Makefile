@@ -9,7 +9,7 @@ RATE ?= 0.1
 SEEDS ?= 5
 # how workers share the tests: tests/conftest.py says which belong together, and which begin
 SHARED := --dist loadgroup --no-loadscope-reorder
-# RESULTS: a folder for a JUnit file of each run, which .ci/run sums up
+# WITHOUT: a further condition of test-slow. RESULTS: a folder for a JUnit file of each run, which .ci/run sums up
 PYTEST = $(BIN)/python -m pytest -p no:cacheprovider $(if $(RESULTS),--junitxml=$(RESULTS)/$@$(1).xml)
 
 DESTDIR ?=
@@ -21,7 +21,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_ROOT_USER_ACTION := ignore
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-slow test-peers pictures test-vm test-vm-long test-arm64 test-long soak soak-short fuzz lint ready programs for-tiers for-peers for-vm bench bench-calibration install uninstall clean
+.PHONY: help demo test test-slow test-computing test-peers pictures test-vm test-vm-services test-vm-times test-vm-long test-arm64 test-long soak soak-short fuzz lint ready programs for-tiers for-peers for-vm bench bench-calibration install uninstall clean
 
 help: ## list the targets
 	@grep -hE '^[a-z0-9-]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/^([a-z0-9-]+):.*## (.*)/  make \1\t\2/' | expand -t 26
@@ -35,8 +35,11 @@ test: $(VENV)/.tests $(VENV)/.tools ## install what they need, then run style, t
 	$(call PYTEST,-alone) -n 0 -m "alone and not slow and not long"
 
 test-slow: $(VENV)/.tests $(VENV)/.tools ready ## run the longer tests: whole flights and calibrations, the demo, the installation
-	$(PYTEST) -n $(JOBS) $(SHARED) -m "slow and not long and not alone and not peers"
+	$(PYTEST) -n $(JOBS) $(SHARED) -m "slow and not long and not alone and not peers$(WITHOUT)"
 	$(call PYTEST,-alone) -n 0 -m "alone and slow and not long"
+
+test-computing: $(VENV)/.tests ready ## run those of test-slow that only compute, and so may run beside anything
+	$(PYTEST) -n $(JOBS) $(SHARED) -m "computing and not long and not alone"
 
 test-peers: $(VENV)/.tests for-peers ## run the tests against gpsd, Foxglove's reader and Chromium, which it installs (root, apt, npm)
 	$(PYTEST) -n 0 -v tests/peers
@@ -44,13 +47,16 @@ test-peers: $(VENV)/.tests for-peers ## run the tests against gpsd, Foxglove's r
 pictures: $(VENV)/.tests for-peers ## make the pictures of docs/console.md again, by Chromium (3 min)
 	$(BIN)/python -m tests.peers.console_pictures
 
-test-vm: $(VENV)/.tests for-vm ## run the tests of CAN, PPS, systemd and power cuts in a virtual machine, which it installs (root, apt, alone)
-	$(PYTEST) -n 2 --dist loadfile -v -m "not alone and not long" tests/vm
-	$(call PYTEST,-alone) -n 0 -v -m "alone and not long" tests/vm
+test-vm: test-vm-services test-vm-times ## run the tests of CAN, PPS, systemd and power cuts in a virtual machine, which it installs (root, apt, alone)
+
+test-vm-services: $(VENV)/.tests for-vm
+	$(PYTEST) -n 0 -v -m "not alone and not long" tests/vm
+
+test-vm-times: $(VENV)/.tests for-vm
+	$(PYTEST) -n 0 -v -m "alone and not long" tests/vm
 
 test-vm-long: $(VENV)/.tests for-vm ## run the same with 50 power cuts, 20 kills of the console and three minutes of flight
-	$(PYTEST) -n 2 --dist loadfile -v -m "not alone" tests/vm
-	$(call PYTEST,-alone) -n 0 -v -m alone tests/vm
+	$(PYTEST) -n 0 -v tests/vm
 
 test-arm64: $(VENV)/.tests ## compare decoders, log and points with an emulated ARM64, which it installs (root, apt)
 	@bash tests/arm64/setup.sh $(VENV)
@@ -84,6 +90,7 @@ ready: $(VENV)/.tests
 
 # what all tiers need; apt and pip install beside each other
 programs: $(VENV)/.tests for-tiers
+	@$(BIN)/python -m tests.vm.installed
 
 for-tiers: $(VENV)/.tools
 	@$(MAKE) for-peers && $(MAKE) for-vm

@@ -30,6 +30,14 @@ LONGEST = (
     "replay",
 )
 
+# Folders whose slow tests only compute: they measure no time and talk to no other process.
+COMPUTING = (
+    "calib",
+    "georef",
+    *("library/test_calibrate.py", "library/test_notebook.py", "library/test_processing.py"),
+    *(f"daemon/processing/{name}" for name in ("calibration", "flightplan", "points", "strips", "trajectory")),
+)
+
 
 def prepare_processes() -> None:
     """Make interpreters started by tests start as quickly as installed ones."""
@@ -65,6 +73,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     once for georef and once for sim; tests of whole commands find these in the cache, or compile them at the same time.
     """
     for item in items:
+        if item.get_closest_marker("slow") and _name(item).startswith(COMPUTING):
+            item.add_marker(pytest.mark.computing)
         marker = item.get_closest_marker("xdist_group")
         if marker is None and _shares_a_fixture(item):
             item.add_marker(pytest.mark.xdist_group(_name(item)))

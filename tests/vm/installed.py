@@ -1,4 +1,7 @@
-"""Makes the program as `make install` installs it, to lay over the machine's root; it is kept in .cache."""
+"""Makes the program as `make install` installs it, to lay over the machine's root; it is kept in .cache.
+
+python -m tests.vm.installed    # before the tests, which otherwise wait for it
+"""
 
 from __future__ import annotations
 
@@ -102,3 +105,7 @@ def _state() -> str:
                 digest.update(str(path.relative_to(TREE)).encode())
                 digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+if __name__ == "__main__":
+    image()

@@ -20,7 +20,7 @@ from swath.daemon.log.recover import recover
 from tests.vm import aircraft, machine
 from tests.vm.installed import with_udev
 
-CUTS, CUTS_LONG = 6, 50
+CUTS, CUTS_LONG = 4, 50
 FSYNC_S = 1.0
 CHUNK_OPEN_S = 0.25
 DISK_MB = 192
