@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from swath.daemon.log.claim import is_being_written
+from swath.daemon.log.directory import LOCK
 from swath.daemon.log.follow import PartFollower
 from swath.daemon.log.format import LogError
 from swath.daemon.log.mcap.chunks import LogBatch
@@ -235,6 +236,8 @@ class LiveFollower:
             following = sign.path  # the recorder skips a file name that is taken
         if os.path.exists(following) and following != part.path:
             return self._open(following) is not None
+        if is_being_written(self._directory / LOCK) and (sign is None or sign.session_id == session_id):
+            return False  # the disk is full: the recorder goes on in a new part when there is space
         self.ended = "the recording has ended" if part.is_read else "the recorder stopped without closing its log"
         return False
 

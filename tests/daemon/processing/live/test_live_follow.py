@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from swath.daemon.log.claim import claim
+from swath.daemon.log.directory import LOCK
 from swath.daemon.log.format import SessionInfo
 from swath.daemon.log.mcap.chunks import LogBatch
 from swath.daemon.log.mcap.encode import encode_block
@@ -138,6 +140,30 @@ class TestFollowing:
         recording = Recording(tmp_path)
         recording.go_on(1.0)
         assert units_of(follower.poll()) == recording.units
+
+    @pytest.mark.parametrize("is_whole", [True, False])
+    def test_a_recorder_whose_disk_is_full_goes_on_in_a_new_part(
+        self, recording: Recording, follow: Follow, monkeypatch: pytest.MonkeyPatch, is_whole: bool
+    ) -> None:
+        """While it waits for space it holds its directory's lock, and no part grows; its end may be missing."""
+        monkeypatch.setattr(live_follow, "GONE_S", 0.0)
+        with (recording.folder / LOCK).open("w") as lock:
+            assert claim(lock.fileno())
+            follower = follow()
+            recording.go_on(1.0)
+            seen = units_of(follower.poll())
+            recording.stop() if is_whole else recording.writer.close()
+            for _ in range(3):
+                seen += units_of(follower.poll())
+            assert follower.ended == ""
+            recording.number += 1
+            recording.writer = recording._open()
+            recording.go_on(1.0)
+            seen += units_of(follower.poll())
+            recording.stop()
+        seen += units_of(follower.poll())
+        assert seen == recording.units
+        assert follower.ended == "the recording has ended"
 
     def test_a_killed_recorder_is_distinguished_from_a_finished_one(
         self, recording: Recording, follow: Follow, monkeypatch: pytest.MonkeyPatch
