@@ -86,7 +86,7 @@ def command(
     options = ImportOptions(
         source or (), _by_source(start, _time_ns), _by_source(baud, _baud), keep_copies, _zone(zone)
     )
-    loaded = load_config(config)
+    loaded = load_config(config, with_plan=True)  # the log stores it
     routes = Routes.of(loaded)
     captures = find_captures(routes, files or (), options)
     size = sum(path.stat().st_size for capture in captures for path in capture.files() if path.exists())

@@ -47,13 +47,13 @@ MAX_PLAN_BYTES = 16 << 20  # each part of a log holds the plan
 MIN_BASELINE_M = 0.1  # a shorter baseline gives no useful heading
 
 
-def check_devices(config: Config) -> list[str]:
-    """Check a configuration whose types are right and return all findings."""
+def check_devices(config: Config, *, with_plan: bool = True) -> list[str]:
+    """Check a configuration whose types are right and return all findings; ``with_plan``: also the plan's files."""
     lines: list[str] = []
     lines += _check_directory(config)
     lines += _check_pps(config)
     lines += _check_files(config)
-    lines += _check_plan(config)
+    lines += _check_plan(config) if with_plan else []
     for kind, name, table in config.device_tables():
         lines += _check_device(config, kind, name, table)
     lines += _check_wires(config)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -299,7 +300,10 @@ class Config:
             )
 
     def attachments(self) -> list[tuple[str, str, bytes]]:
-        """Return the attachments of every log as (name, media type, bytes); docs/log-format.md lists the names."""
+        """Return the attachments of every log as (name, media type, bytes); docs/log-format.md lists the names.
+
+        Files of the flight plan that cannot be read are left out: who needs them has checked them.
+        """
         found = [("config.toml", "application/toml", self.text.encode())]
         for _, name, table in self.device_tables():
             for key, path in self.files_of(table).items():
@@ -307,7 +311,8 @@ class Config:
                 if all(attachment != other for other, _, _ in found):
                     found.append((attachment, _media_type(path), path.read_bytes()))
         for path in self.plan_files():
-            found.append((plan_attachment(path.name), _media_type(path), path.read_bytes()))
+            with contextlib.suppress(OSError, ValueError):
+                found.append((plan_attachment(path.name), _media_type(path), path.read_bytes()))
         packages = {
             key: {"package": package.name, "version": package.version} for key, package in self.packages().items()
         }
@@ -322,8 +327,8 @@ class Config:
             if name is None:
                 continue
             path = self.resolve(name)
-            beside = [path.with_suffix(one) for one in (*PLAN_BESIDE, *map(str.upper, PLAN_BESIDE))]
-            shapes = [one for one in beside if one.is_file()] if path.suffix.lower() == ".shp" else []
+            suffixes = (*PLAN_BESIDE, *map(str.upper, PLAN_BESIDE)) if path.suffix.lower() == ".shp" else ()
+            shapes = [one for one in map(path.with_suffix, suffixes) if one.is_file()]
             found += [one for one in (path, *shapes) if one not in found]
         return found
 

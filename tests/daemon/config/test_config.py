@@ -21,6 +21,7 @@ from swath.daemon.config.faults import _model_in
 from swath.daemon.config.load import MAX_CONFIG_BYTES, validate
 from swath.daemon.config.rotations import matrix_of_deg, rotation_problem
 from swath.daemon.errors import ConfigError, ExitCode, UserError
+from swath.daemon.log.directory import log_directory
 from swath.daemon.log.parsers import stored_parsers
 from swath.daemon.processing.setup.models import mount_of
 from swath.drivers.driver import RAW, all_drivers
@@ -145,7 +146,7 @@ class TestBadFiles:
         expected = expected_lines(path)
         assert expected, f"{path} says nothing of what to expect"
         with pytest.raises(ConfigError) as caught:
-            load_config(path)
+            load_config(path, with_plan=True)
         assert sorted(_shortened(caught.value.lines, expected)) == sorted(expected)
         assert caught.value.exit_code is ExitCode.USAGE
         assert all("\n" not in line for line in caught.value.lines)
@@ -154,6 +155,18 @@ class TestBadFiles:
         text = with_session('[imu.main]\ntransport = "can:can0"\nprotocol = "dbc"\ndbc = "a.dbc"\ngrade = "mems"\n')
         with pytest.raises(ConfigError, match=r"imu\.main\.grade: unknown key; did you mean noise\.grade\?"):
             parse_config(text, tmp_path / "a.toml")
+
+    @pytest.mark.parametrize("name", ["gone.kml", "/", "a\\u0000.kml"])
+    def test_a_plan_that_is_missing_is_missed_only_where_it_is_needed(self, tmp_path: Path, name: str) -> None:
+        """In the office the plan's file is elsewhere; a log that shall hold it, and live over such a log, need it."""
+        path = tmp_path / "a.toml"
+        path.write_text(with_session(f'directory = "."\n[plan]\nfile = "{name}"\n'))
+        config = load_config(path)
+        assert [attachment for attachment, _, _ in config.attachments()] == ["config.toml"]
+        assert log_directory(path) == tmp_path
+        for options in ({"to_record": True}, {"with_plan": True}):
+            with pytest.raises(ConfigError, match=r"plan\.file: .*give a file, relative to the configuration"):
+                load_config(path, **options)
 
     def test_a_missing_file_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(UserError, match=r"nowhere\.toml: No such file or directory") as caught:
