@@ -55,7 +55,9 @@ def command(
     serve: Annotated[
         bool, typer.Option("--serve", help="Also serve live.mcap's topics to Foxglove, on this computer only.")
     ] = False,
-    serve_port: Annotated[int, typer.Option(help="--serve: port to listen at.", min=0, max=65535)] = 8765,
+    serve_port: Annotated[
+        int | None, typer.Option(help="--serve: port to listen at; 8765 if none is given.", min=0, max=65535)
+    ] = None,
     accept_verdict: AcceptVerdict = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the status as JSON, one object per line.")] = False,
 ) -> None:
@@ -67,8 +69,10 @@ def command(
     """
     require_installed("swath live", "foxglove")
     _check(where, output, replay=replay)
+    if serve_port is not None and not serve:
+        raise UserError("--serve-port needs --serve, which serves Foxglove's viewer", ExitCode.USAGE)
     paths = where or [DEFAULT_CONFIG]
-    with _serving(serve_port if serve else None) as server:
+    with _serving(serve, serve_port) as server:
         if replay:
             found = _replay(paths, output or Path(), points, server, accept_verdict=accept_verdict, as_json=as_json)
         else:
@@ -81,14 +85,14 @@ def command(
 
 
 @contextlib.contextmanager
-def _serving(port: int | None) -> Iterator[LiveServer | None]:
-    """Serve Foxglove's viewer during the block; without a port, nothing is served."""
-    if port is None:
+def _serving(serve: bool, port: int | None) -> Iterator[LiveServer | None]:
+    """Serve Foxglove's viewer during the block if it is wanted, at the port that the viewer proposes by default."""
+    if not serve:
         yield None
         return
-    from swath.daemon.processing.live.serve import ADDRESS, LiveServer
+    from swath.daemon.processing.live.serve import ADDRESS, PORT, LiveServer
 
-    server = LiveServer(port)
+    server = LiveServer(PORT if port is None else port)
     print(f"serving ws://{ADDRESS}:{server.port} for Foxglove", file=sys.stderr, flush=True)
     try:
         yield server
@@ -280,7 +284,7 @@ def _replay(
             f"--replay takes one session and at most one configuration; got the sessions {names or 'none'}",
             ExitCode.USAGE,
         )
-    config: Config | None = load_config(configs[0]) if configs else None
+    config: Config | None = load_config(configs[0], with_plan=True) if configs else None
     options = Options(uncertainty=False)
     setup = Setup.of_session(sessions[0], config, options)
     live: LiveConfig = setup.config.tables.live

@@ -435,6 +435,7 @@ class TestCommand:
             (["--replay", "some.mcap"], "--replay needs logs and -o DIR: swath live --replay LOG… -o DIR [CONFIG]"),
             (["-o", "x"], "-o needs --replay"),
             (["a", "b"], "too many arguments; give one CONFIG or DIR"),
+            (["a", "--serve-port", "8765"], "--serve-port needs --serve"),
         ],
     )
     def test_wrong_usage_is_refused_in_one_line(self, arguments: list[str], told: str) -> None:
