@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from swath.daemon.config.tables import PlanConfig
-from swath.daemon.processing.flightplan.geometry import LineGeometry
+from swath.daemon.processing.flightplan.geometry import LineGeometry, Places
 from swath.daemon.processing.flightplan.judge import LineVerdict, Reason
 from swath.daemon.processing.flightplan.lines import Line
 from swath.daemon.processing.flightplan.plan import PlannedLine
-from swath.georef.arrays import BoolArray, FloatArray, Int64Array
+from swath.georef.arrays import BoolArray, FloatArray, Int64Array, SingleArray
 from swath.georef.geodesy.earth import e_from_geodetic, geodetic_from_e
 
 PARALLEL_RAD = math.radians(20.0)
 SAME_TRACK = 0.1  # of the swath's half: a nearer line, as at another height, is no neighbour
 FAR = 1.5  # of both halves of the swaths: a line farther away is no neighbour
 LEAST_M = 50.0  # shorter stretches of too little overlap are no remark
+NEAREST = 6  # lines that are looked at as neighbours, by the plan
+LOOKS = 40  # places of a line at which these are looked for
 DUE_SHARE = 0.3  # of the tolerance: a line that was flown this far off towards the outside is to blame
 
 
@@ -40,32 +42,175 @@ class _Side:
     other_outward_m: FloatArray
 
 
-def overlap_reasons(
-    geometry: LineGeometry, planned: Sequence[PlannedLine], lines: Sequence[Line], config: PlanConfig
-) -> None:
-    """Set the lines' ``overlap``: the worst lack of overlap for which a line is to blame.
+@dataclass(slots=True, eq=False)
+class _Neighbour:
+    """The nearest planned line on a side of a flown one.
 
-    Of two neighbours, the line is to blame that was flown off its plan, away from the other; if neither was, as over
-    ground higher than planned, the one that was flown later.
+    Attributes:
+        line: its place in the plan.
+        side: 1: to the right, -1: to the left.
+        cells: (n,) cells of the flown line.
+        along_m, across_m, inside: (n,) where they are on the neighbour, and whether they lie beside it.
+        verdict: of the neighbour, for which ``beside`` holds.
+        beside: both lines' cells there; None: the neighbour is not flown there, or too far away.
     """
-    wanted = (config.wanted.overlap_percent or 0.0) / 100.0
-    due_m = DUE_SHARE * config.tolerance.cross_track_m
-    for one, line in enumerate(lines):
-        worst: Reason | None = None
-        if line.verdict is None:
-            line.take_overlap(None)
-            continue
+
+    line: int
+    side: int
+    cells: Int64Array
+    along_m: SingleArray
+    across_m: SingleArray
+    inside: BoolArray
+    verdict: LineVerdict | None = None
+    beside: _Side | None = None
+
+    def face(self, own: LineVerdict, verdict: LineVerdict | None) -> None:
+        """Compare the flown line with the neighbour's newest verdict, if that has changed."""
+        if verdict is not self.verdict:
+            self.verdict = verdict
+            self.beside = None if verdict is None else _facing(own, verdict, self)
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """Two neighbouring lines.
+
+    Attributes:
+        first, second: names, in the order of the plan.
+        least: overlap by the narrower swath that is not reached on `LEAST_M` of them; negative: a gap.
+    """
+
+    first: str
+    second: str
+    least: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Beside:
+    """Where the middles of a line's cells are on the lines nearest to it, by the plan alone.
+
+    Attributes:
+        lines: (m,) places of these lines in the plan.
+        along_m, across_m: (n, m) on each of them, to a centimetre as all lengths here.
+        right_m: (n, m) how far each of them lies to the right, as seen in the line's direction.
+        parallel: (n, m) whether it lies beside the cell, in about the same direction or the opposite one.
+    """
+
+    lines: Int64Array
+    along_m: SingleArray
+    across_m: SingleArray
+    right_m: SingleArray
+    parallel: BoolArray
+
+
+class Overlaps:
+    """Overlap of the swaths of neighbouring lines; what has not changed is not computed again.
+
+    Args:
+        planned: the lines.
+        geometry: of the lines.
+    """
+
+    def __init__(self, planned: Sequence[PlannedLine], geometry: LineGeometry) -> None:
+        self._planned, self._geometry = planned, geometry
+        self._plan: dict[int, _Beside] = {}
+        self._known: dict[int, tuple[LineVerdict, list[_Neighbour]]] = {}
+        self._watching: dict[int, set[int]] = {}  # by line, those whose neighbour it is
+
+    def blame(self, lines: Sequence[Line], config: PlanConfig, changed: Iterable[int]) -> None:
+        """Set the ``overlap`` of changed lines and their neighbours: the worst lack for which a line is to blame.
+
+        Of two neighbours, the line is to blame that was flown off its plan, away from the other; if neither was, as
+        over ground higher than planned, the one that was flown later.
+        """
+        wanted = (config.wanted.overlap_percent or 0.0) / 100.0
+        due_m = DUE_SHARE * config.tolerance.cross_track_m
+        for one in sorted({*changed, *(other for line in changed for other in self._watching.get(line, ()))}):
+            line = lines[one]
+            worst: Reason | None = None
+            for neighbour, beside in self._beside(lines, one):
+                other = lines[neighbour.line]
+                lacks = beside.overlap < wanted
+                if not lacks.any():
+                    continue
+                theirs = np.maximum(beside.other_outward_m, 0.0) > np.maximum(beside.outward_m, 0.0)
+                is_due = np.maximum(beside.outward_m, beside.other_outward_m) > due_m
+                blamed = np.where(is_due, ~theirs, _is_later(line, other))
+                worst = _worse(worst, _lack(line, other.name, beside, lacks & blamed, wanted))
+            line.take_overlap(worst)
+
+    def pairs(self, lines: Sequence[Line]) -> list[Pair]:
+        """Return the neighbours that have both been flown, in the order of the plan."""
+        found: dict[tuple[int, int], float] = {}
+        for one, line in enumerate(lines):
+            for neighbour, beside in self._beside(lines, one):
+                assert line.verdict is not None
+                key = min(one, neighbour.line), max(one, neighbour.line)
+                count = min(len(beside.overlap), math.ceil(LEAST_M / line.verdict.cell_m))
+                least = float(np.partition(beside.overlap, count - 1)[count - 1])
+                found[key] = min(least, found.get(key, math.inf))
+        return [Pair(lines[one].name, lines[other].name, least) for (one, other), least in sorted(found.items())]
+
+    def _beside(self, lines: Sequence[Line], one: int) -> list[tuple[_Neighbour, _Side]]:
+        """Return a line's neighbours that have been flown beside it; on each side one at most."""
+        verdict = lines[one].verdict
+        if verdict is None:
+            self._known.pop(one, None)
+            return []
+        kept = self._known.get(one)
+        if kept is None or kept[0] is not verdict:
+            kept = self._known[one] = verdict, self._neighbours(verdict, one)
+        for neighbour in kept[1]:
+            neighbour.face(verdict, lines[neighbour.line].verdict)
+        return [(neighbour, neighbour.beside) for neighbour in kept[1] if neighbour.beside is not None]
+
+    def _neighbours(self, verdict: LineVerdict, one: int) -> list[_Neighbour]:
+        """Return the nearest planned line on each side of a flown one."""
+        flown = np.flatnonzero(verdict.flown & ~np.isnan(verdict.right_m - verdict.left_m))
+        if not len(flown):
+            return []
+        if one not in self._plan:
+            self._plan[one] = self._by_plan(verdict, one)
+        plan = self._plan[one]
+        found = []
         for side in (-1, 1):
-            found = _beside(geometry, planned, lines, one, side)
-            if found is None:
+            edge = float(np.median(verdict.right_m[flown] if side > 0 else -verdict.left_m[flown]))
+            lies = side * plan.right_m[flown]
+            inside = plan.parallel[flown] & (lies > SAME_TRACK * edge)
+            there = np.flatnonzero(inside.any(axis=0))
+            if not len(there):
                 continue
-            other, beside = found
-            lacks = beside.overlap < wanted
-            theirs = np.maximum(beside.other_outward_m, 0.0) > np.maximum(beside.outward_m, 0.0)
-            is_due = np.maximum(beside.outward_m, beside.other_outward_m) > due_m
-            blamed = np.where(is_due, ~theirs, _is_later(line, lines[other]))
-            worst = _worse(worst, _lack(line, lines[other].name, beside, lacks & blamed, wanted))
-        line.take_overlap(worst)
+            distance_m = [float(np.median(lies[inside[:, at], at])) for at in there.tolist()]
+            at = int(there[np.argmin(distance_m)])
+            other = int(plan.lines[at])
+            along, across = plan.along_m[flown, at], plan.across_m[flown, at]
+            found.append(_Neighbour(other, side, flown, along, across, inside[:, at]))
+            self._watching.setdefault(other, set()).add(one)
+        return found
+
+    def _by_plan(self, verdict: LineVerdict, one: int) -> _Beside:
+        """Return where the line's cells are on the lines that are nearest to it."""
+        along_m = (np.arange(len(verdict.flown), dtype=np.float64) + 0.5) * verdict.cell_m
+        lat, lon, azimuth = _middle(self._planned[one], along_m, float(self._geometry.length_m[one]))
+        sample = slice(None, None, max(1, len(along_m) // LOOKS))
+        places = self._geometry.places(lat[sample], lon[sample])
+        parallel, _ = _relation(places, self._geometry.length_m, azimuth[sample])
+        away_m = np.where(parallel, np.abs(places.across_m), math.inf).min(axis=0)
+        away_m[one] = math.inf
+        lines = np.sort(np.argsort(away_m, kind="stable")[: int(min(NEAREST, np.isfinite(away_m).sum()))])
+        geometry = LineGeometry([self._planned[line] for line in lines.tolist()])
+        places = geometry.places(lat, lon)
+        parallel, right_m = _relation(places, geometry.length_m, azimuth)
+        along32_m, across32_m = places.along_m.astype(np.float32), places.across_m.astype(np.float32)
+        return _Beside(lines, along32_m, across32_m, right_m.astype(np.float32), parallel)
+
+
+def _relation(places: Places, length_m: FloatArray, azimuth: FloatArray) -> tuple[BoolArray, FloatArray]:
+    """Return whether lines lie beside places on a line with these directions, and how far to the right; (n, lines)."""
+    turned = np.cos(azimuth[:, np.newaxis] - places.azimuth_rad)
+    parallel = (places.along_m >= 0.0) & (places.along_m <= length_m) & (np.abs(turned) > math.cos(PARALLEL_RAD))
+    # the neighbour lies to our right if we lie to its left, as seen in our direction
+    return parallel, -places.across_m * np.sign(turned)
 
 
 def _is_later(line: Line, other: Line) -> bool:
@@ -94,62 +239,21 @@ def _lack(line: Line, other: str, beside: _Side, mask: BoolArray, wanted: float)
     return Reason("overlap", is_grave, text, 100 * least, 100 * wanted, from_m, to_m)
 
 
-def _beside(
-    geometry: LineGeometry, planned: Sequence[PlannedLine], lines: Sequence[Line], one: int, side: int
-) -> tuple[int, _Side] | None:
-    """Return the nearest flown neighbour on a side (1: right), and both lines' cells there."""
-    verdict = lines[one].verdict
-    assert verdict is not None
-    edge = verdict.right_m if side > 0 else -verdict.left_m
-    known = np.flatnonzero(verdict.flown & ~np.isnan(edge))
-    if not len(known):
-        return None
-    lat, lon, azimuth = _middle(
-        planned[one], (known.astype(np.float64) + 0.5) * verdict.cell_m, float(geometry.length_m[one])
-    )
-    places = geometry.places(lat, lon)
-    turned = np.cos(azimuth[:, np.newaxis] - places.azimuth_rad)
-    # the neighbour lies to our right if we lie to its left, as seen in our direction
-    lies = -places.across_m * np.sign(turned) * side
-    inside = (places.along_m >= 0.0) & (places.along_m <= geometry.length_m)
-    inside &= (np.abs(turned) > math.cos(PARALLEL_RAD)) & (lies > SAME_TRACK * float(np.median(edge[known])))
-    inside[:, one] = False
-    there = np.flatnonzero(inside.any(axis=0))
-    if not len(there):
-        return None
-    distance_m = np.array([float(np.median(lies[inside[:, other], other])) for other in there.tolist()])
-    other = int(there[np.argmin(distance_m)])
-    neighbour = lines[other].verdict
-    if neighbour is None:
-        return None
-    found = _facing(
-        verdict, neighbour, known, places.along_m[:, other], places.across_m[:, other], inside[:, other], side
-    )
-    return None if found is None else (other, found)
-
-
-def _facing(
-    verdict: LineVerdict,
-    other: LineVerdict,
-    known: Int64Array,
-    along: FloatArray,
-    across: FloatArray,
-    inside: BoolArray,
-    side: int,
-) -> _Side | None:
-    theirs = np.clip((along / other.cell_m).astype(np.int64), 0, len(other.flown) - 1)
-    is_right = across > 0.0  # of the other line
+def _facing(verdict: LineVerdict, other: LineVerdict, neighbour: _Neighbour) -> _Side | None:
+    """Return a flown line's cells beside a neighbour's; None: there are none, or no overlap was planned."""
+    theirs = np.clip((neighbour.along_m / other.cell_m).astype(np.int64), 0, len(other.flown) - 1)
+    is_right = neighbour.across_m > 0.0  # of the other line
     edge = np.where(is_right, other.right_m[theirs], -other.left_m[theirs])
-    inside = inside & other.flown[theirs] & ~np.isnan(edge)
+    inside = neighbour.inside & other.flown[theirs] & ~np.isnan(edge)
     if not inside.any():
         return None
-    cells, theirs, edge = known[inside], theirs[inside], edge[inside]
-    own_edge = verdict.right_m[cells] if side > 0 else -verdict.left_m[cells]
+    cells, theirs, edge = neighbour.cells[inside], theirs[inside], edge[inside]
+    own_edge = verdict.right_m[cells] if neighbour.side > 0 else -verdict.left_m[cells]
     width = np.minimum(verdict.right_m[cells] - verdict.left_m[cells], other.right_m[theirs] - other.left_m[theirs])
-    distance = np.abs(across[inside])
+    distance = np.abs(neighbour.across_m[inside])
     if float(np.median(distance)) > FAR * float(np.median(own_edge + edge)):
-        return None  # no overlap was planned
-    outward = -side * verdict.across_m[cells]
+        return None
+    outward = -neighbour.side * verdict.across_m[cells]
     other_outward = np.where(is_right[inside], -1.0, 1.0) * other.across_m[theirs]
     return _Side(cells, theirs, (own_edge + edge - distance) / width, outward, other_outward)
 

@@ -24,7 +24,7 @@ from swath.daemon.processing.flightplan.geometry import (
 )
 from swath.daemon.processing.flightplan.judge import Limits
 from swath.daemon.processing.flightplan.lines import Line, Overrule, Pass, parsed_overrule, plain_line
-from swath.daemon.processing.flightplan.overlap import overlap_reasons
+from swath.daemon.processing.flightplan.overlap import Overlaps, Pair
 from swath.daemon.processing.flightplan.plan import FlightPlan
 from swath.georef.arrays import BoolArray, FloatArray, StructArray
 from swath.georef.compiled import jit_cached, jit_inline
@@ -176,6 +176,7 @@ class LineWatch:
         self._last_line: int | None = None
         self._due_lines: BoolArray | None = None
         self._geometry = self._drawn()
+        self._overlaps = Overlaps(plan.lines, self.geometry)
         self._reach_m = max(REACH_TOLERANCES * config.tolerance.cross_track_m, LEAST_REACH_M)
 
     # ------------------------------------------------------------------ poses
@@ -345,13 +346,18 @@ class LineWatch:
 
     def refresh(self) -> None:
         """Judge all lines anew that have something new."""
-        changed = any(line.is_new for line in self.lines)
+        changed = [place for place, line in enumerate(self.lines) if line.is_new]
         if changed:
             self._due_lines = None
         for line in self.lines:
             line.refresh()
         if changed and self._config.wanted.overlap_percent is not None:
-            overlap_reasons(self.geometry, self.plan.lines, self.lines, self._config)
+            self._overlaps.blame(self.lines, self._config, changed)
+
+    def overlap_pairs(self) -> list[Pair]:
+        """Return how much the swaths of neighbouring lines overlap that have been flown."""
+        self.refresh()
+        return self._overlaps.pairs(self.lines)
 
     def plain(self) -> dict[str, Any]:
         """Return the state of all lines as plain values, without the geometry."""

@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 from pyproj import Geod
 
+from swath.daemon.processing.flightplan.geometry import LineGeometry, Places
 from swath.daemon.processing.flightplan.lines import parsed_overrule
 from swath.daemon.processing.flightplan.moments import STEP_NS, Moments, empty_moments
 from swath.daemon.processing.flightplan.watch import LineWatch
+from swath.georef.arrays import FloatArray
 from tests.daemon.processing.flightplan.builders import (
     DENSITY,
     KINDS,
@@ -127,6 +129,33 @@ def test_overlap_is_the_fault_of_the_line_that_left_its_plan() -> None:
     (reason,) = plain["lines"][1]["reasons"]
     assert reason["value"] == pytest.approx(10.0, abs=1.0)
     assert reason["text"].startswith("overlap 10 % with line 1, below 20 % on 1200 m")
+
+
+def test_least_overlap_of_pairs_is_that_of_the_geometry_and_is_not_looked_for_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Swaths of 693 m, 15 % and 30 % overlap; line 2 (to the west) is flown 30 m to its right, away from line 1."""
+    lines = [*parallel(2, 0.85 * WIDTH_M), parallel(3, 0.85 * WIDTH_M)[2] | {"name": "3"}]
+    lines[2] |= {key: [lines[2][key][0], 1.55 * WIDTH_M] for key in ("from_m", "to_m")}
+    flight = flown(lines, [Defect("2", "off", 0.5, 30.0)], {"overlap_percent": 20.0}, turbulence="none")
+    looks: list[FloatArray] = []
+    places = LineGeometry.places
+
+    def counted(geometry: LineGeometry, lat_rad: FloatArray, lon_rad: FloatArray) -> Places:
+        looks.append(lat_rad)
+        return places(geometry, lat_rad, lon_rad)
+
+    watched = watch(flight, moments_of(flight))
+    assert isinstance(watched, LineWatch)
+    monkeypatch.setattr(LineGeometry, "places", counted)
+    away = 30.0 / WIDTH_M
+    assert [(one.first, one.second) for one in watched.overlap_pairs()] == [("1", "2"), ("2", "3")]
+    assert [one.least for one in watched.overlap_pairs()] == pytest.approx([0.15 - away, 0.30 + away], abs=0.01)
+    before = watched.plain()
+    looks.clear()
+    watched.lines[1].is_new = True
+    assert watched.plain() == before
+    assert looks == []  # where lines lie beside each other is known from the plan, once they have been flown
 
 
 def test_steering_agrees_with_geodesics() -> None:
