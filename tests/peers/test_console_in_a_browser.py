@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -16,7 +14,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from numpy.typing import NDArray
 from PIL import Image
-from playwright.sync_api import Browser, Page, expect, sync_playwright
+from playwright.sync_api import Page, expect
 from pyproj import Transformer
 
 from swath.daemon.console.painting import RAMPS
@@ -36,11 +34,11 @@ from tests.daemon.console.builders import (
 from tests.daemon.log_check import read_log
 from tests.daemon.processing.live.builders import Utm, flight
 from tests.daemon.rig import Recorder, free_udp_port, session_table, wait_until
+from tests.peers.conftest import SIZES, Opened
 
 pytestmark = pytest.mark.peers
 
 SCRIPT = "<img src=x onerror=alert(1)>"
-SIZES = ((1920, 1080), (1280, 800), (800, 1280))
 WAIT_MS = 20_000.0
 SCALE = "30 m"  # at four pixels a metre
 CELLS = 40  # along each side of the square that is painted
@@ -55,48 +53,6 @@ OVERLAP = {
 }  # fmt: skip
 # as WCAG 2.1 AA, which axe knows by these names
 RULES = {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "best-practice"]}
-
-
-@dataclass
-class Opened:
-    """A page, the addresses that it asked and the errors that it told."""
-
-    page: Page
-    asked: list[str] = field(default_factory=list)
-    errors: list[str] = field(default_factory=list)
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    program = shutil.which("chromium") or shutil.which("chromium-browser")
-    assert program is not None, "there is no chromium: make test-peers installs it"
-    with sync_playwright() as playwright:
-        opened = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
-        yield opened
-        opened.close()
-
-
-@pytest.fixture
-def open_page(browser: Browser) -> Iterator[Callable[..., Opened]]:
-    contexts = []
-
-    def opened(address: str, size: tuple[int, int] = SIZES[0], scheme: str = "light") -> Opened:
-        context = browser.new_context(
-            viewport={"width": size[0], "height": size[1]},
-            color_scheme="dark" if scheme == "dark" else "light",
-        )
-        contexts.append(context)
-        found = Opened(context.new_page())
-        found.page.on("request", lambda request: found.asked.append(request.url))
-        found.page.on("console", lambda told: found.errors.append(told.text) if told.type == "error" else None)
-        found.page.on("pageerror", lambda error: found.errors.append(str(error)))
-        found.page.on("dialog", lambda dialog: found.errors.append(f"dialog: {dialog.message}"))
-        found.page.goto(address)
-        return found
-
-    yield opened
-    for context in contexts:
-        context.close()
 
 
 @pytest.fixture(scope="module")
