@@ -332,6 +332,7 @@ class LineWatch:
                 one.left_ns = int(rows["gps_ns"][-1]) if len(rows) else one.begin_ns
             self._settle(one)
         self.current = self.steering = None
+        self.refresh()
 
     def overrule(self, text: str, time_ns: int) -> bool:
         """Take the operator's note, ``line NAME: accepted, NOTE``; return whether it is one."""
