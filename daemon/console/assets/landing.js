@@ -73,15 +73,16 @@ function showChecks(checks, predicted) {
 
 function showGaps(area) {
   const gaps = area?.gaps ?? [];
+  const waters = area?.waters ?? [];
   const more = area?.more_gaps ?? 0;
   text("gaps-note", gaps.length ? more ? `The largest; ${number(more)} smaller ones are not listed` : "" : area ? "None" : "No point yet");
-  $("gaps").hidden = !gaps.length;
-  $("gap-rows").replaceChildren(...gaps.map((gap) => {
+  $("gaps").hidden = !gaps.length && !waters.length;
+  $("gap-rows").replaceChildren(...[...gaps, ...waters].map((gap) => {
     const link = document.createElement("a");
     link.href = `/#at=${gap.east_m},${gap.north_m},${Math.ceil(gap.length_m)}`;
     link.textContent = gap.lat_deg === null ? "on the map" : `${gap.lat_deg.toFixed(5)}°, ${gap.lon_deg.toFixed(5)}°`;
-    const why = gap.under.length ? [`flown over on ${gap.under.join(", ")}: water?`, "warn"] : ["not covered", "bad"];
-    return row(String(gap.number), size(gap.area_m2), `${number(gap.width_m)} m`, gap.line, link, why);
+    const why = gap.water ? ["no echo: water?", "warn"] : gap.under.length ? [`flown over on ${gap.under.join(", ")}: water?`, "warn"] : ["not covered", "bad"];
+    return row(`${gap.water ? "water " : ""}${gap.number}`, size(gap.area_m2), `${number(gap.width_m)} m`, gap.line, link, why);
   }));
 }
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from swath.calib.strips.standards import QUALITY_LEVELS
 from swath.daemon.config.tables import PlanWantedConfig
+from swath.daemon.processing.flightplan.overlap import Pair
 from swath.daemon.processing.landing.command import AGAIN, FLY_AGAIN, GOOD, HOME, OPEN, REMARK, UNKNOWN, WAIT
 from swath.daemon.processing.landing.facts import LogFacts, Standing
 from swath.daemon.processing.landing.tracks import FlownPairs
@@ -23,6 +24,7 @@ from swath.georef.timescales.gps_time import SECOND_NS
 SHOWN_NAMES = 20
 SPARSE_REMARK, SPARSE_AGAIN = 0.05, 0.10  # of the blocks that may lie below the density, and below half of it
 USUAL_LEVEL = "QL2"  # of the height differences of strips, if ``quality_level`` names none
+NO_ECHO = "no echo came back: water, or a surface that swallows light"
 ENOUGH_CORRECTIONS = 0.95  # of the flight
 
 
@@ -56,6 +58,7 @@ class FoundGap:
         area_m2, width_m, length_m: size.
         line: the nearest line; empty: there is no plan.
         under: lines whose swaths covered nearly all of it, so that the laser was there.
+        water: no gap: pulses came here whose echo did not return.
     """
 
     number: int
@@ -68,14 +71,17 @@ class FoundGap:
     length_m: float
     line: str = ""
     under: tuple[str, ...] = ()
+    water: bool = False
 
     def plain(self) -> dict[str, Any]:
         """Return plain values for ``verdict.json``."""
-        return asdict(self) | {"under": list(self.under), "grave": not self.under, "text": self.text}
+        return asdict(self) | {"under": list(self.under), "grave": not self.under and not self.water, "text": self.text}
 
     @property
     def text(self) -> str:
         """The gap in words."""
+        if self.water:
+            return f"{size_words(self.area_m2)}, {self.width_m:.0f} m wide; {NO_ECHO}"
         where = f", nearest to line {self.line}" if self.line and not self.under else ""
         said = f"{size_words(self.area_m2)}, {self.width_m:.0f} m wide{where}"
         if self.under:
@@ -93,6 +99,8 @@ class Covered:
         cell_m: side of the cells; what is narrower is not seen.
         gaps: of at least the wanted size, the largest ones.
         more: number of further gaps of that size.
+        water_m2: size of the part of the area where pulses came back without an echo alone.
+        waters: the largest of its pieces of at least the wanted size.
         densities: first returns on a square metre (n,) of squares within the area.
     """
 
@@ -102,6 +110,8 @@ class Covered:
     cell_m: float
     gaps: tuple[FoundGap, ...] = ()
     more: int = 0
+    water_m2: float = 0.0
+    waters: tuple[FoundGap, ...] = ()
     densities: FloatArray = field(default_factory=lambda: np.zeros(0))
 
 
@@ -168,6 +178,7 @@ def gaps_check(lines: Mapping[str, Any], covered: Covered | None, limit_m2: floa
         return Check("gaps", title, UNKNOWN, "no point yet")
     bare = _bare(lines, covered)
     details = [f"gap {gap.number}: {gap.text}" for gap in covered.gaps]
+    details += [f"water {one.number}: {one.text}" for one in covered.waters]
     if covered.more:
         details.append(f"and {covered.more} smaller ones, whose places are not looked at")
     count = len(covered.gaps) + covered.more
@@ -175,12 +186,14 @@ def gaps_check(lines: Mapping[str, Any], covered: Covered | None, limit_m2: floa
     size = f"{size_words(covered.wanted_m2)} of the area, {share:.2f} % with points"
     found = f"{count} of {limit_m2:g} m² and more" if covered.gaps else f"none of {limit_m2:g} m² or more"
     found += f", in cells of {covered.cell_m:g} m"
+    if covered.water_m2 >= limit_m2:
+        found += f"; {size_words(covered.water_m2)} without an echo, as over water"
     if not covered.has_area:
         text = (
             f"{found}, between points up to 25 m apart; no area is planned, so that what is missing beside is unknown"
         )
         return Check("gaps", title, AGAIN if bare else UNKNOWN, text, tuple(details))
-    state = AGAIN if bare else REMARK if covered.gaps else GOOD
+    state = AGAIN if bare else REMARK if covered.gaps or covered.waters else GOOD
     return Check("gaps", title, state, f"{found}; {size}", tuple(details))
 
 
@@ -212,27 +225,63 @@ def density_check(lines: Mapping[str, Any], wanted: PlanWantedConfig, covered: C
     return Check("density", title, state, text, details)
 
 
-def overlap_check(lines: Mapping[str, Any], wanted: PlanWantedConfig, differences: Mapping[str, Any]) -> Check:
-    """Judge the overlap of neighbouring lines, and say how well strips agree in height."""
+def overlap_check(
+    lines: Mapping[str, Any], wanted: PlanWantedConfig, differences: Mapping[str, Any], pairs: Sequence[Pair] = ()
+) -> Check:
+    """Judge the overlap of neighbouring lines, and say how well strips agree in height.
+
+    Args:
+        lines: as in ``lines.json``.
+        wanted: what the plan wants.
+        differences: figures of all strips' height differences, as in ``coverage.json``.
+        pairs: neighbouring lines that have been flown.
+    """
     title = "Overlap"
     said = "no two strips have been compared in height"
     rms_m = differences.get("rms_m")
     if rms_m is not None:
         said = f"heights of strips agree to {100 * rms_m:.1f} cm (RMS over {differences['cells']:,} cells)"
+    least = _pair_words(pairs, wanted.overlap_percent)
     if wanted.overlap_percent is None:
         text = f"{said}; [plan.wanted] overlap_percent says not how much overlap is wanted"
-        return Check("overlap", title, UNKNOWN, text)
+        return Check("overlap", title, UNKNOWN, text, least)
     if lines["plan"] is None:
         return Check("overlap", title, UNKNOWN, f"{said}; without a plan the overlap is not judged")
     details = _reasons(lines, "overlap")
     grave = any(reason["grave"] for _, reason in _with(lines, "overlap"))
-    lacks = f"less than {wanted.overlap_percent:g} % on {len(details)} lines" if details else "as wanted"
+    accepted = _accepted(lines)
+    lacking = [
+        one
+        for one in pairs
+        if 100.0 * one.least < wanted.overlap_percent and one.first not in accepted and one.second not in accepted
+    ]
+    lacks = f"less than {wanted.overlap_percent:g} % of {_count(lacking)}" if lacking else "as wanted"
+    if details:
+        lacks = f"less than {wanted.overlap_percent:g} % on {len(details)} lines"
     level = next(one for one in QUALITY_LEVELS if one.name == (wanted.quality_level or USUAL_LEVEL))
     disagree = rms_m is not None and rms_m > level.overlap_m
     if disagree:
         said += f", {level.name} allows {100 * level.overlap_m:.0f} cm; calibration or trajectory may explain it"
-    state = AGAIN if grave else REMARK if details or disagree else GOOD
-    return Check("overlap", title, state, f"{lacks}; {said}", details)
+    state = AGAIN if grave else REMARK if details or lacking or disagree else GOOD
+    return Check("overlap", title, state, f"{lacks}; {said}", (*details, *least))
+
+
+def _count(pairs: Sequence[Pair]) -> str:
+    return f"{len(pairs)} pair{'s' if len(pairs) > 1 else ''} of lines"
+
+
+def _pair_words(pairs: Sequence[Pair], wanted_percent: float | None) -> tuple[str, ...]:
+    """Return the least overlap of pairs in words, the worst ones first."""
+    limit = "" if wanted_percent is None else f", wanted {wanted_percent:g} %"
+    ordered = sorted(pairs, key=lambda one: one.least)
+    words = [
+        f"lines {one.first} and {one.second}: "
+        + (f"least overlap {100 * one.least:.0f} %{limit}" if one.least >= 0.0 else f"a gap{limit}")
+        for one in ordered[:SHOWN_NAMES]
+    ]
+    if len(ordered) > SHOWN_NAMES:
+        words.append(f"{_count(ordered[SHOWN_NAMES:])} more: at least {100 * ordered[SHOWN_NAMES].least:.0f} %{limit}")
+    return tuple(words)
 
 
 def _with(lines: Mapping[str, Any], code: str) -> list[tuple[str, Mapping[str, Any]]]:
@@ -286,7 +335,10 @@ def base_check(facts: LogFacts, configured: Sequence[str]) -> Check:
     """
     title, details = "Base data", list(_fix_words(facts))
     if not configured:
-        text = "no [corrections] are configured: whether a base station recorded the whole flight is not known here"
+        text = (
+            "no [corrections] are configured: whether a base station recorded the whole flight is not known here; "
+            "swath landing --base tells it by the station's files"
+        )
         return Check("base", title, UNKNOWN, text, tuple(details))
     begin_ns, end_ns = facts.read_from_ns or 0, facts.newest_ns
     worst, texts = GOOD, []
@@ -407,9 +459,14 @@ def sentence(lines: Mapping[str, Any], checks: Sequence[Check], covered: Covered
         return WAIT, f"Wait: {_lines(flying)} is being flown"
     if not lines["lines"]:
         return WAIT, "Nothing has been flown yet"
+    return HOME, home_sentence([(one.state, one.title) for one in checks])
+
+
+def home_sentence(checks: Sequence[tuple[str, str]]) -> str:
+    """Return the sentence of a flight that may go home, by states and titles of the checks."""
     words = ["You can go home"]
     for state, said in ((REMARK, "With remarks"), (UNKNOWN, "Not known"), (OPEN, "Still to do")):
-        titles = [one.title.lower() for one in checks if one.state == state]
+        titles = [title.lower() for one, title in checks if one == state]
         if titles:
             words.append(f"{said}: {', '.join(titles)}")
-    return HOME, ". ".join(words)
+    return ". ".join(words)

@@ -17,6 +17,7 @@ MOST_CELLS = 8_000_000  # of a map whose gaps are looked for; cells of a larger 
 REACH_M = 25.0  # without an area, gaps are what lies between points no farther apart
 MOST_OPEN = 0.1  # of a gap's edge without points, there; a corner between two swaths that cross has more
 MOST_DEPTHS = 250_000
+POINTS, NO_RETURN = 0, 1  # bits of a tile that are kept
 SAMPLE = 60  # cells of a gap whose place is looked at
 BESIDE = ndimage.generate_binary_structure(2, 2)  # cells that touch at a corner belong together
 
@@ -29,6 +30,7 @@ class Ground:
         west_m, south_m: edges, in the frame ``local``.
         cell_m: side of a cell.
         covered: (rows, columns) True where there is a point.
+        water: (rows, columns) True where there is none, but pulses came whose echo did not return.
         block: cells along a side of a block.
         pulses: (rows / block, columns / block) first returns of a block.
     """
@@ -37,6 +39,7 @@ class Ground:
     south_m: float
     cell_m: float
     covered: BoolArray
+    water: BoolArray
     block: int
     pulses: FloatArray
 
@@ -80,7 +83,7 @@ class Painted:
         block = self.block
         for place, cells in tiles:
             sums = cells["pulses"].reshape(SIDE // block, block, SIDE // block, block).sum(axis=(1, 3), dtype=float)
-            self._tiles[place] = np.packbits(cells["points"] > 0, axis=1), sums
+            self._tiles[place] = np.packbits([cells["points"] > 0, cells["no_return"] > 0], axis=2), sums
 
     @property
     def block(self) -> int:
@@ -114,22 +117,27 @@ class Painted:
         join = 1
         while join < SIDE and (east - west) * (north - south) * (SIDE // join) ** 2 > MOST_CELLS:
             join *= 2
-        covered = self._covered((west, south, east, north), join)
-        while join < SIDE and _thin_share(covered) > MOST_THIN:
+        covered, mute = (self._cells((west, south, east, north), join, kind) for kind in (POINTS, NO_RETURN))
+        while join < SIDE and _thin_share(covered | mute) > MOST_THIN:
             join *= 2
-            covered = _joined(covered)
+            covered, mute = _joined(covered), _joined(mute)
         block = max(join, self.block)
         pulses = self._pulses((west, south, east, north), block)
-        return Ground(west * side_m, south * side_m, join * self._cell_m, covered, block // join, pulses)
+        return Ground(
+            west * side_m, south * side_m, join * self._cell_m, covered, mute & ~covered, block // join, pulses
+        )
 
-    def _covered(self, edges: tuple[int, int, int, int], join: int) -> BoolArray:
-        """Return cells between edges, in tiles, ``join`` of the map's along a side; True: has a point."""
+    def _cells(self, edges: tuple[int, int, int, int], join: int, kind: int) -> BoolArray:
+        """Return cells between edges, in tiles, ``join`` of the map's along a side.
+
+        True: has a point (`POINTS`), or a pulse without an echo (`NO_RETURN`).
+        """
         west, south, east, north = edges
         side = SIDE // join
         covered = np.zeros(((north - south) * side, (east - west) * side), np.bool_)
         for (column, row), (bits, _) in self._tiles.items():
             if west <= column < east and south <= row < north:
-                cells: BoolArray = np.unpackbits(bits, axis=1).view(np.bool_)
+                cells: BoolArray = np.unpackbits(bits[kind], axis=1).view(np.bool_)
                 for _ in range(join.bit_length() - 1):  # a power of two
                     cells = _joined(cells)
                 up, across = (row - south) * side, (column - west) * side
@@ -211,8 +219,13 @@ def between(ground: Ground) -> BoolArray:
 
 
 def gaps_of(ground: Ground, wanted: BoolArray, least_m2: float) -> list[Gap]:
-    """Return the gaps in the wanted cells (rows, columns), of at least a size, the largest first."""
-    labels, count = ndimage.label(wanted & ~ground.covered, BESIDE)
+    """Return the gaps in the wanted cells (rows, columns), of at least a size, the largest first; water is none."""
+    return joined_cells(ground, wanted & ~ground.covered & ~ground.water, least_m2)
+
+
+def joined_cells(ground: Ground, mask: BoolArray, least_m2: float) -> list[Gap]:
+    """Return what masked cells (rows, columns) form that touch each other, of at least a size, the largest first."""
+    labels, count = ndimage.label(mask, BESIDE)
     if not count:
         return []
     sizes = np.bincount(labels.ravel())[1:] * ground.cell_m**2

@@ -36,7 +36,8 @@ LINES = "lines.json"  # of `swath.daemon.processing.live.lines`, which is slow t
 MAP, MARGIN = 1000, 0.07  # longer side of the map, and its margin in parts of it
 LABEL = 26.0  # from a line's begin to its name, there
 RASTER = 800  # cells along the longer side at most
-COVERED, TWICE, GAP = (201, 214, 222, 255), (159, 182, 198, 255), (215, 25, 28, 255)
+COVERED, TWICE = (201, 214, 222, 255), (159, 182, 198, 255)
+GAP, WATER = (215, 25, 28, 255), (127, 179, 213, 255)
 COLOURS = {"planned": "#5b6770", "flying": "#0072b2", "good": "#00598c", "remarks": "#8a4b00", "again": "#b3261e"}
 STATES = {
     "planned": "not flown",
@@ -64,7 +65,8 @@ PREDICTED_HOW = (
 )
 ALT = "Map of the lines, the area and the gaps"
 LEGEND = (
-    "Pale: cells with points, darker where several strips have some. Red: cells that have none and should. "
+    "Pale: cells with points, darker where several strips have some. Red: cells that have none and should. Light blue: "
+    "no echo came back, as over water. "
     "Numbers: gaps of the table, blue where swaths have covered them. Lines: blue good, brown with remarks, red to be "
     "flown again, dotted not flown."
 )
@@ -166,16 +168,20 @@ def _checks(found: Mapping[str, Any]) -> Table:
 
 def _gaps(found: Mapping[str, Any]) -> list[Block]:
     area = found["area"]
-    if not area or not area["gaps"]:
+    waters = (area or {}).get("waters", [])
+    if not area or not (area["gaps"] or waters):
         return []
     rows: list[list[Cell]] = []
-    for gap in area["gaps"]:
+    for gap in [*area["gaps"], *waters]:
         place = "" if gap["lat_deg"] is None else f"{gap['lat_deg']:.5f}°, {gap['lon_deg']:.5f}°"
         said: Cell = (
             f"flown over on {', '.join(gap['under'])}: water?" if gap["under"] else Judged("not covered", good=False)
         )
+        number = str(gap["number"])
+        if gap.get("water"):
+            number, said = f"water {number}", "no echo: water?"
         size, width = size_words(gap["area_m2"]), f"{gap['width_m']:.0f} m"
-        rows.append([str(gap["number"]), size, width, gap["line"], place, said])
+        rows.append([number, size, width, gap["line"], place, said])
     heads = ("gap", "size", "width", "nearest line", "latitude, longitude", "why")
     note = f"In cells of {area['cell_m']:g} m; what is narrower is not seen."
     return [Table("Gaps", heads, rows, note, left=(0, 4, 5), omitted=area["more_gaps"])]
@@ -318,9 +324,10 @@ def _raster(
     cell_m = step * reader.cell_m
     columns, rows = (math.ceil(float(size) / cell_m) for size in high - low)
     covered, strips = np.zeros((rows, columns), np.bool_), np.zeros((rows, columns), np.int64)
-    ground = Ground(float(low[0]), float(low[1]), cell_m, covered, 1, np.zeros((rows, columns)))
+    water = np.zeros_like(covered)
+    ground = Ground(float(low[0]), float(low[1]), cell_m, covered, water, 1, np.zeros((rows, columns)))
     (west_m, south_m), (east_m, north_m) = low.tolist(), high.tolist()
-    view = reader.view(west_m, south_m, east_m, north_m, cell_m, ("points", "strips"))
+    view = reader.view(west_m, south_m, east_m, north_m, cell_m, ("points", "no_return", "strips"))
     if view is not None:
         where = ground.centres_m(np.arange(max(rows, columns)), np.arange(max(rows, columns)))
         across = np.floor((where[:columns, 0] - view.west_m) / view.cell_m).astype(np.int64)
@@ -328,12 +335,14 @@ def _raster(
         there = ((up >= 0) & (up < view.shape[0]))[:, None] & ((across >= 0) & (across < view.shape[1]))[None, :]
         at = np.ix_(up.clip(0, view.shape[0] - 1), across.clip(0, view.shape[1] - 1))
         covered[:] = there & (view.layers["points"][at] > 0)
+        water[:] = there & ~covered & (view.layers["no_return"][at] > 0)
         strips[:] = np.where(there, view.layers["strips"][at], 0)
     wanted: BoolArray = inside(ground, area) if area else between(ground)
     image = np.full((rows, columns, 4), 255, np.uint8)
     image[ground.covered] = COVERED
     image[ground.covered & (strips > 1)] = TWICE
     image[wanted & ~ground.covered] = GAP
+    image[water] = WATER
     times = max(1, 2 * RASTER // max(rows, columns))  # printers smooth what they enlarge
     large = np.ascontiguousarray(image[::-1].repeat(times, axis=0).repeat(times, axis=1))
     return data_uri(png(large), "image/png"), np.array([columns, rows]) * cell_m

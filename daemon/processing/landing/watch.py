@@ -33,7 +33,7 @@ from swath.daemon.processing.landing.checks import (
 )
 from swath.daemon.processing.landing.command import VERDICT, VERSION
 from swath.daemon.processing.landing.facts import LogFacts
-from swath.daemon.processing.landing.gaps import Gap, Ground, Painted, between, densities, gaps_of, inside
+from swath.daemon.processing.landing.gaps import Gap, Ground, Painted, between, densities, gaps_of, inside, joined_cells
 from swath.daemon.processing.landing.tracks import pairs_of, tracks_of
 from swath.daemon.processing.live.files import replace_file
 from swath.georef.arrays import BoolArray, FloatArray
@@ -109,6 +109,7 @@ def covered_of(
     ground = painted.ground(edges_m)
     wanted = outline.wanted(ground)
     gaps = gaps_of(ground, wanted, least_m2)
+    waters = joined_cells(ground, wanted & ground.water, least_m2)
     cell_m2 = ground.cell_m**2
     return Covered(
         bool(outline.polygons),
@@ -117,11 +118,14 @@ def covered_of(
         ground.cell_m,
         tuple(_found(number + 1, gap, watch, places) for number, gap in enumerate(gaps[:MOST_GAPS])),
         max(0, len(gaps) - MOST_GAPS),
+        float((wanted & ground.water).sum()) * cell_m2,
+        tuple(_found(number + 1, gap, None, places) for number, gap in enumerate(waters[:MOST_GAPS])),
         densities(ground, wanted),
     )
 
 
-def _found(number: int, gap: Gap, watch: LineWatch | StripWatch, places: Places) -> FoundGap:
+def _found(number: int, gap: Gap, watch: LineWatch | StripWatch | None, places: Places) -> FoundGap:
+    """Return what is known of a gap; without a watch, of water."""
     lat_lon = None if places.geodetic_deg is None else places.geodetic_deg(gap.place_m[np.newaxis])[0].tolist()
     line, under = "", list[str]()
     if isinstance(watch, LineWatch) and places.geodetic_deg is not None:
@@ -139,6 +143,7 @@ def _found(number: int, gap: Gap, watch: LineWatch | StripWatch, places: Places)
         round(gap.length_m, 1),
         line,
         tuple(under),
+        water=watch is None,
     )
 
 
@@ -264,11 +269,12 @@ class Landing:
         """
         lines, wanted, facts = watch.plain(), self._config.wanted, self.facts
         track = facts.track
+        pairs = watch.overlap_pairs() if isinstance(watch, LineWatch) else []
         checks = [
             lines_check(lines, trouble),
             gaps_check(lines, covered, wanted.gap_m2),
             density_check(lines, wanted, covered),
-            overlap_check(lines, wanted, differences),
+            overlap_check(lines, wanted, differences, pairs),
             calibration_check(pairs_of(tracks_of(track)), self._calibration),
             base_check(facts, self._corrections),
             static_check(facts, wanted.static_s),
@@ -287,6 +293,12 @@ class Landing:
             "sentence": said,
             "checks": [_plain(check) for check in checks],
             "area": _plain_area(covered),
+            "overlaps": {
+                "wanted_percent": wanted.overlap_percent,
+                "pairs": [
+                    {"lines": [one.first, one.second], "least_percent": round(100.0 * one.least, 1)} for one in pairs
+                ],
+            },
             "lines": [
                 {"name": line["name"], "state": line["state"], "flown_fraction": line["flown_fraction"]}
                 | {"why": [reason["text"] for reason in line["reasons"]], "overruled": line["overruled"]}
@@ -354,4 +366,6 @@ def _plain_area(covered: Covered | None) -> dict[str, Any] | None:
         else dict(zip(("p05", "p50"), np.quantile(values, [0.05, 0.5]).round(2).tolist(), strict=True)),
         "gaps": [gap.plain() for gap in covered.gaps],
         "more_gaps": covered.more,
+        "water_m2": round(covered.water_m2, 1),
+        "waters": [one.plain() for one in covered.waters],
     }

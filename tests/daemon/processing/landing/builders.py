@@ -40,9 +40,12 @@ def places_of(flight: Flight) -> Places:
     return Places(local_m, geodetic_deg)
 
 
-def painted(rows: StructArray, places: Places) -> Painted:
-    """Return the map's cells: the returns of each moment lie evenly between the edges of its swath."""
-    rows = rows[rows["returns"] > 0]
+def painted(rows: StructArray, places: Places, *, tells_water: bool = False) -> Painted:
+    """Return the map's cells: the returns of each moment lie evenly between the edges of its swath.
+
+    With ``tells_water`` the scanner's pulses without a return are told, and lie likewise.
+    """
+    rows = rows[(rows["returns"] > 0) | ((rows["empty"] > 0) & tells_water)]
     here = places.local_m(np.degrees(np.stack([rows["lat_rad"], rows["lon_rad"]], axis=-1)))
     along = np.stack([np.sin(rows["track_rad"]), np.cos(rows["track_rad"])], axis=-1)
     right = np.stack([along[:, 1], -along[:, 0]], axis=-1)
@@ -66,8 +69,10 @@ def painted(rows: StructArray, places: Places) -> Painted:
     shape = height * SIDE, width * SIDE
     flat = (ups - south * SIDE) * shape[1] + columns - west * SIDE
     each = np.repeat(rows["returns"] / (count * SUB_STEPS), count * SUB_STEPS)
+    answers = np.repeat(rows["returns"] > 0, count * SUB_STEPS)
     cells = np.zeros(shape, CELL_DTYPE)
-    cells["points"] = np.bincount(flat, minlength=cells.size).reshape(shape)
+    cells["points"] = np.bincount(flat[answers], minlength=cells.size).reshape(shape)
+    cells["no_return"] = np.bincount(flat[~answers], minlength=cells.size).reshape(shape)
     cells["pulses"] = np.rint(np.bincount(flat, each, minlength=cells.size)).reshape(shape)
     found = Painted()
     found.take(
@@ -91,7 +96,13 @@ def with_area(plan: FlightPlan, places: Places, corners_m: FloatArray) -> Flight
 
 
 def verdict_of(
-    flight: Flight, rows: StructArray, plan: FlightPlan | None = None, marks: tuple[str, ...] = (), **follower: Any
+    flight: Flight,
+    rows: StructArray,
+    plan: FlightPlan | None = None,
+    marks: tuple[str, ...] = (),
+    *,
+    tells_water: bool = False,
+    **follower: Any,
 ) -> dict[str, Any]:
     """Return the verdict on a flight whose moments are ``rows``; the log is complete and nothing else is known."""
     watched = watch(flight, rows)
@@ -102,5 +113,6 @@ def verdict_of(
     landing.facts.has_ended = True
     places = places_of(flight)
     found = plan or flight.plan
-    covered = covered_of(painted(rows, places), watched, Outline(found, places), places, flight.config.wanted.gap_m2)
+    cells = painted(rows, places, tells_water=tells_water)
+    covered = covered_of(cells, watched, Outline(found, places), places, flight.config.wanted.gap_m2)
     return landing.verdict(watched, found, "", covered, DIFFERENCES, {"part": 0} | follower)

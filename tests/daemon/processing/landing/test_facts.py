@@ -11,6 +11,7 @@ import pytest
 from matplotlib.path import Path as Outline
 
 from swath.daemon.config.tables import PlanWantedConfig
+from swath.daemon.processing.flightplan.overlap import Pair
 from swath.daemon.processing.landing.checks import (
     base_check,
     calibration_check,
@@ -150,6 +151,12 @@ def test_nothing_is_good_that_was_not_asked_for_or_not_measured() -> None:
     asked = PlanWantedConfig(overlap_percent=20.0)
     assert overlap_check(LINES, asked, {"cells": 9, "rms_m": 0.03}).state == "good"
     assert overlap_check(LINES, asked, {"cells": 9, "rms_m": 0.12}).state == "remark"
+    pairs = [Pair(str(n), str(n + 1), 0.3 - 0.01 * n) for n in range(22)]
+    lacking = overlap_check(LINES, asked, {"cells": 9, "rms_m": 0.03}, pairs)
+    assert (lacking.state, lacking.text.split(";")[0]) == ("remark", "less than 20 % of 11 pairs of lines")
+    assert lacking.details[0] == "lines 21 and 22: least overlap 9 %, wanted 20 %"
+    assert lacking.details[20:] == ("2 pairs of lines more: at least 29 %, wanted 20 %",)
+    assert overlap_check(LINES, wanted, {"cells": 0}, pairs[:1]).details == ("lines 0 and 1: least overlap 30 %",)
     assert overlap_check(LINES | {"plan": None}, asked, {"cells": 9, "rms_m": 0.03}).state == "unknown"
     assert sentence(LINES, [], None) == ("wait", "Nothing has been flown yet")
     flying = LINES | {"lines": [{"name": "4", "state": "flying"}]}
@@ -161,7 +168,8 @@ def test_cells_inside_an_area_are_those_of_another_library() -> None:
     angle = np.linspace(0.0, 2.0 * np.pi, 11)[:-1]
     star = 40.3 * np.stack([np.cos(angle), np.sin(angle)], axis=-1) * np.where(np.arange(10) % 2, 0.4, 1.0)[:, None]
     hole = 8.7 * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    ground = Ground(-50.0, -50.0, 1.0, np.zeros((96, 104), np.bool_), 8, np.zeros((12, 13)))
+    none = np.zeros((96, 104), np.bool_)
+    ground = Ground(-50.0, -50.0, 1.0, none, none, 8, np.zeros((12, 13)))
     rows, columns = np.indices(ground.covered.shape)
     centres = ground.centres_m(rows.ravel(), columns.ravel())
     expected = Outline(star).contains_points(centres) & ~Outline(hole).contains_points(centres)

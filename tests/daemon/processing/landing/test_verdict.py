@@ -35,10 +35,12 @@ def states(found: dict[str, Any]) -> dict[str, str]:
     return {one["code"]: one["state"] for one in found["checks"]}
 
 
-def test_gaps_in_the_area_have_the_size_and_the_line_of_the_truth() -> None:
+@pytest.mark.parametrize("tells_water", [False, True])
+def test_gaps_in_the_area_have_the_size_and_the_line_of_the_truth(tells_water: bool) -> None:
     """Line 1's scanner is silent for 5 s in the east, line 2 flies over a lake in the west, line 4 is not flown.
 
-    The sizes follow from the geometry alone: 30° to either side at 600 m, 30 % overlap, 60 m/s.
+    The sizes follow from the geometry alone: 30° to either side at 600 m, 30 % overlap, 60 m/s. A scanner that tells
+    its pulses without an echo makes the lake water, and no gap.
     """
     lines = parallel(4, SPACING_M, LENGTH_M)
     defects = [Defect("1", "silent", 0.75, 5.0), Defect("2", "water", 0.75, 5.0)]
@@ -47,7 +49,7 @@ def test_gaps_in_the_area_have_the_size_and_the_line_of_the_truth() -> None:
     # from 200 m south of line 1 to 500 m north of line 3: line 1's neighbour covers what is 484 m away and more
     north_m = 2 * SPACING_M + 500.0
     corners = np.array([[100.0, -200.0], [LENGTH_M - 100.0, -200.0], [LENGTH_M - 100.0, north_m], [100.0, north_m]])
-    found = verdict_of(flight, moments_of(flight), with_area(flight.plan, places, corners))
+    found = verdict_of(flight, moments_of(flight), with_area(flight.plan, places, corners), tells_water=tells_water)
     assert found["sentence"] == "Fly again: line 1. Not flown: line 4"
     assert (found["state"], states(found)["gaps"]) == ("again", "again")
     half_m = 600.0 * math.tan(HALF_ANGLE_RAD)
@@ -55,7 +57,12 @@ def test_gaps_in_the_area_have_the_size_and_the_line_of_the_truth() -> None:
     water_m2 = 300.0 * 2.0 * (SPACING_M - half_m)
     beyond_m2 = (LENGTH_M - 200.0) * (500.0 - half_m)
     gaps = {(gap["line"], tuple(gap["under"])): gap for gap in found["area"]["gaps"]}
-    assert len(found["area"]["gaps"]) == 3
+    assert len(found["area"]["gaps"]) == 2 + (not tells_water)
+    if tells_water:
+        (gaps["2", ("2",)],) = found["area"]["waters"]
+        assert found["area"]["water_m2"] == pytest.approx(water_m2, rel=0.05)
+        assert " ha without an echo, as over water; " in check(found, "gaps")["text"]
+        assert check(found, "gaps")["details"][-1].startswith("water 1: ")
     # the lake's gap is seen in line 2's swath; line 4's lies beyond the reach of line 3
     for key, area_m2, width_m in (
         (("1", ()), silent_m2, 300.0),
@@ -88,6 +95,12 @@ def test_a_complete_flight_goes_home_and_says_what_is_not_known() -> None:
         "lines", "gaps", "density", "overlap", "calibration",
     ]  # fmt: skip
     assert found["area"]["density_per_m2"]["p50"] == pytest.approx(DENSITY, rel=0.45)  # and overlaps are denser
+    assert found["overlaps"]["wanted_percent"] == 20.0
+    assert {tuple(pair["lines"]): pair["least_percent"] for pair in found["overlaps"]["pairs"]} == {
+        ("1", "2"): pytest.approx(30.0, abs=1.0),
+        ("2", "3"): pytest.approx(30.0, abs=1.0),
+    }
+    assert "lines 1 and 2: least overlap 30 %, wanted 20 %" in check(found, "overlap")["details"]
 
 
 def test_without_an_area_nothing_says_that_all_is_covered() -> None:
