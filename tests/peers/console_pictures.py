@@ -8,6 +8,7 @@ and grows slowly while they are photographed, so that live has no need to skip a
 from __future__ import annotations
 
 import io
+import json
 import os
 import shutil
 import sys
@@ -17,6 +18,7 @@ import uuid
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 from PIL import Image
 from playwright.sync_api import Page, Playwright, sync_playwright
 
@@ -27,11 +29,13 @@ from swath.daemon.simulate.into_log import fly_into_log
 from swath.sim.companions import companion_files, config_text, default_wires
 from swath.sim.fly import VirtualFlight
 from swath.sim.plan.plan import Plan, load_plan
+from swath.sim.site import Site, geodetic_from_e
 from tests.builders import ROOT, running
 from tests.daemon.console.builders import Asked, console
 
 PICTURES = ROOT / "docs/console"
 QUALITY = 82
+AREA = ((-330.0, -230.0), (330.0, 230.0))  # metres east and north
 PACE, SLOW_PACE = 2.0, 0.3
 SETTLED_S = 8.0  # that open pages show before they are photographed
 FLOWN = 0.4  # of the last line, when the pictures are made
@@ -59,6 +63,7 @@ SHOTS = (
     Shot("lines-800x1280-day", (800, 1280), "light", panel="Lines"),
     Shot("data-800x1280-night", (800, 1280), "dark", panel="Data"),
     Shot("pilot-1280x800", (1280, 800), "dark", path="/pilot"),
+    Shot("landing-1280x800-day", (1280, 800), "light", path="/landing"),
 )
 
 
@@ -82,11 +87,22 @@ def fly(folder: Path) -> Path:
     for name, data in companion_files(plan, flight.site, flight.scene).items():
         (folder / name).write_bytes(data)
     (folder / "plan.toml").write_text(planned.text)
+    (folder / "area.geojson").write_text(area_text(flight.site))
     text = config_text(plan, default_wires(plan), "logs").replace("nominal.toml", "true.toml")
-    text += '[plan]\nfile = "plan.toml"\n[plan.wanted]\nquality_level = "QL1"\noverlap_percent = 10\n'
+    text = text.replace('file = "plan.toml"', 'file = "plan.toml"\narea = "area.geojson"')
+    text += '[plan.wanted]\nquality_level = "QL1"\noverlap_percent = 10\ndensity_per_m2 = 2\n'
     (folder / "swath.toml").write_text(text)
     fly_into_log(load_config(folder / "swath.toml"), folder / "logs", flight, plan.tables.flight.seed)
     return folder / "logs"
+
+
+def area_text(site: Site) -> str:
+    """Return the ground between the first and the last line as GeoJSON."""
+    (west, south), (east, north) = AREA
+    corners = np.array([(west, south), (east, south), (east, north), (west, north), (west, south)])
+    lat, lon, _ = geodetic_from_e(site.e_from_site(np.column_stack([corners, np.zeros(5)])))
+    ring = np.degrees(np.column_stack([lon, lat])).tolist()
+    return json.dumps({"type": "Polygon", "coordinates": [ring]})
 
 
 def _middle_s(plan: Plan) -> float:
