@@ -37,6 +37,12 @@ def command(
             "--predict/--no-predict", help="Predict what the lines flown determine of the calibration: half a minute."
         ),
     ] = True,
+    base: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE", help="RINEX observations of a base station, also packed by gzip; for each file once."
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the verdict as one JSON object.")] = False,
 ) -> None:
     """Say before landing whether to fly again or to go home, and why.
@@ -52,6 +58,10 @@ def command(
         raise UserError(f"-o: got {one_line(str(output))}, want a name that ends in {HTML}", ExitCode.USAGE)
     live = _folder(where)
     found = read_verdict(live)
+    if base:
+        from swath.daemon.processing.landing.base import with_base
+
+        found = with_base(found, base)
     found["predicted"] = _predicted(live, str(found.get("session_id")), predict=predict)
     warnings: list[str] = []
     written = [] if output is None else _write(live, found, output, warnings, overwrite=overwrite)
