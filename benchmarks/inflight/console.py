@@ -59,13 +59,14 @@ class MadeFlight:
         position_e = e_from_geodetic(np.radians(47.0), np.radians(9.0), 500.0)
         self.about: dict[str, Any] = {"cell_m": CELL_M, "placement": LocalFrame(position_e, None).placement()}
         self.draw = np.random.default_rng(1)
+        self.text = "bank 12° over the limit of 10°, 100 to 400 m"
         self.write(self.places)
 
     def write(self, places: list[tuple[int, int]]) -> None:
         """Write some tiles, the lines and the status."""
         self.at = places[0]
         self.folder.write([(place, self._tile) for place in places], self.about)
-        reason = {"code": "bank", "grave": False, "text": "bank 12° over the limit of 10°, 100 to 400 m", "value": 12.0}
+        reason = {"code": "bank", "grave": False, "text": self.text, "value": 12.0}
         lines = [
             {"name": str(number), "state": "remarks", "reasons": [reason], "flown_fraction": 1.0, "passes": 1}
             for number in range(LINES)

@@ -51,6 +51,7 @@ class Painter:
     _reader: TileReader = field(init=False)
     _lock: threading.Lock = field(default_factory=threading.Lock)
     _kept: OrderedDict[tuple[Any, ...], bytes] = field(default_factory=OrderedDict)
+    _steps: tuple[tuple[int, int], NDArray[np.int64]] = ((-1, -1), np.zeros((3, 0), np.int64))
     _heights: tuple[int, tuple[float, float]] = (-1, (0.0, 1.0))
     _placed: tuple[Any, Placement | None] = (None, None)
 
@@ -155,16 +156,16 @@ class Painter:
     def _newest(self, zoom: int, x: int, y: int) -> int:
         """Return the newest step of the tiles that a picture shows."""
         west, south, east, north = self._edges_m(zoom, x, y, MARGIN)
-        side_m = 128 * self._reader.cell_m
-        steps = [
-            at
-            for (column, row), at in self._reader.changed().items()
-            if column * side_m < east
-            and (column + 1) * side_m > west
-            and row * side_m < north
-            and (row + 1) * side_m > south
-        ]
-        return max(steps, default=0)
+        reader = self._reader
+        key = reader.generation, reader.sequence
+        if self._steps[0] != key:
+            rows = [(column, row, at) for (column, row), at in reader.changed().items()]
+            self._steps = key, np.array(rows, np.int64).reshape(-1, 3).T
+        column, row, at = self._steps[1]
+        side_m = 128 * reader.cell_m
+        inside = (column * side_m < east) & ((column + 1) * side_m > west)
+        inside &= (row * side_m < north) & ((row + 1) * side_m > south)
+        return int(at[inside].max(initial=0))
 
     def _height_range(self) -> tuple[float, float]:
         """Return the 2 % and 98 % quantiles of the heights, in steps that rarely change."""

@@ -15,9 +15,11 @@ from swath.daemon.console.background import Background
 from swath.daemon.console.painting import Painter
 from swath.daemon.monitor.display import DEGRADED, NOT_RECORDING, RECORDING, Monitor, follower_of, news
 from swath.daemon.processing.landing.command import PREDICTED, VERDICT
+from swath.daemon.processing.live.tiles import INDEX, TILES
 
 EVERY_S = 1.0
-STEERING_S = 0.2  # live writes it twice a second, and a pilot should not wait
+MAP_EVERY_S, LEAST_S = 1.3, 0.6  # while the map changes: at the latest, and from when on for the map's sake
+SOON_S = 0.2  # between two looks at how to steer, and at whether the map has changed: nobody should wait for these
 HISTORY_S = 600
 EVENTS_KEPT = 500
 STALE_S = 5.0  # live writes its status each second
@@ -86,6 +88,15 @@ class LookFile:
             return "", None
 
 
+def sign_of(path: Path) -> str:
+    """Return a text that changes when a file is replaced; empty: there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return ""
+    return f"{found.st_mtime_ns:x}-{found.st_size:x}"
+
+
 @dataclass(slots=True)
 class Numbered:
     """Numbers the events of a recording, so that pages can acknowledge them; the monitor forgets old ones."""
@@ -126,6 +137,7 @@ class Watch(threading.Thread):
         self.steering: Plain = {}
         self._live, self._lines = JsonFile(live / LIVE_STATUS), JsonFile(live / LIVE_LINES)
         self._steering = JsonFile(live / LIVE_STEERING)
+        self._map = live / TILES / INDEX
         self.live, self._verdict, self._predicted = live, JsonFile(live / VERDICT), JsonFile(live / PREDICTED)
         self.looks = {name: LookFile(live / file, kind) for name, (file, kind) in LOOKS.items()}
         self.tell = tell
@@ -136,13 +148,17 @@ class Watch(threading.Thread):
         self._ended, self._reading = threading.Event(), threading.Lock()
 
     def run(self) -> None:
-        """Read until `close`: all once a second, how to steer as often as live tells it."""
-        next_s = time.monotonic()
-        while not self._ended.wait(STEERING_S):
-            steering = self._steering.content() or {}
-            is_due = time.monotonic() >= next_s
+        """Read until `close`: how to steer as often as live tells it, all once a second, with the map's changes.
+
+        These are shown as soon as they are there: a page should not wait for the next second.
+        """
+        read_s = next_s = time.monotonic()
+        while not self._ended.wait(SOON_S):
+            steering, map_sign = self._steering.content() or {}, sign_of(self._map)
+            now_s, has_changed = time.monotonic(), map_sign != self.latest.get("map", map_sign)
+            is_due = now_s >= (read_s + LEAST_S if has_changed else next_s)
             if is_due:
-                next_s = time.monotonic() + EVERY_S
+                read_s, next_s = now_s, now_s + (MAP_EVERY_S if has_changed else EVERY_S)
                 self.read()
             if is_due or steering != self.steering:
                 self.steering = steering
@@ -165,6 +181,7 @@ class Watch(threading.Thread):
             self._session = found["session_id"]
             self._events = Numbered()
         self._events.take(found["events"])
+        map_sign = sign_of(self._map)  # before its content is read
         live, lines = self._live.content(), self._lines.content()
         live_age_s = self._live.age_s if live is not None else None
         is_live = live_age_s is not None and live_age_s < STALE_S
@@ -180,6 +197,7 @@ class Watch(threading.Thread):
             "lines": lines or {},
             "landing": self._landing(),
             "legend": self.painter.legend(),
+            "map": map_sign,
             "drawn": self._drawn(lines),
             "extent_m": self.painter.extent_m,
             "background": None if self.background is None else self.background.plain(),

@@ -12,7 +12,7 @@ let origin = [0, 0]; // of the frame in metres of its coordinate system, which t
 let place = null; // of the background
 let drawn = "";
 let placed = false;
-let sequence = -1;
+let written = ""; // when the map was, as the console tells it
 
 const at = (east, north) => [north, east];
 
@@ -31,7 +31,7 @@ function makeTiles() {
   return new Painted({ tileSize: TILE, minZoom: -7, maxZoom: 3, updateWhenZooming: false });
 }
 
-const address = (where) => `/tiles/${$("layer").value}/${where.z}/${where.x}/${where.y}.png?s=${sequence}`;
+const address = (where) => `/tiles/${$("layer").value}/${where.z}/${where.x}/${where.y}.png?s=${written}`;
 
 // The user's map; its squares lie as those of the painted one.
 function makeBackground() {
@@ -232,9 +232,8 @@ export function startMap() {
     seek(map);
     drawPlan(found);
     showLegend(found.legend);
-    const next = found.live.tiles?.sequence ?? -1;
-    if (next !== sequence) {
-      sequence = next;
+    if (found.map !== written) {
+      written = found.map;
       refresh();
     }
     text("map-note", found.live_is_current || found.live.state ? found.background?.trouble ?? "" : "swath live does not run: no map");

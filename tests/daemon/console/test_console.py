@@ -226,6 +226,18 @@ def the_last_moments_are_given_once(asked: Asked, live: Path) -> None:
         assert asked.get(f"/look/{name}", If_None_Match=sign).body == b"afterwards"
 
 
+def test_pages_are_told_that_the_map_has_changed(tmp_path: Path) -> None:
+    live = tmp_path / "live"
+    with console(tmp_path) as (asked, _):
+        shown = (found["map"] for found in asked.feed())
+        seen = [next(shown)]
+        for _ in range(3):
+            write_map(live, {(0, 0): {"points": np.ones((SIDE, SIDE), np.uint32)}})
+            seen.append(next(sign for sign in shown if sign != seen[-1]))
+        assert asked.snapshot()["map"] == seen[-1]
+    assert (seen[0], len(set(seen))) == ("", 4)
+
+
 def test_files_that_are_no_json_leave_the_console_well(tmp_path: Path) -> None:
     live = tmp_path / "live"
     live.mkdir()
