@@ -279,7 +279,7 @@ def test_every_option_is_documented() -> None:
 def test_make_help_lists_every_target() -> None:
     listed = {line.split()[1] for line in run("make", "--no-print-directory", "help").stdout.splitlines()}
     tests = {"test", "test-slow", "test-peers", "test-vm", "test-vm-long", "test-arm64", "test-long"}
-    tests |= {"soak", "soak-short", "fuzz", "pictures"}
+    tests |= {"soak", "soak-short", "fuzz", "pictures", "test-computing"}
     assert listed == {"help", "demo", "lint", "bench", "bench-calibration", "install", "uninstall", "clean"} | tests
 
 

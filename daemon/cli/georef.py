@@ -58,6 +58,9 @@ def command(
         str | None, typer.Option(metavar="ADDRESS", help="Compute on the Dask cluster at this address (tcp://…).")
     ] = None,
     no_sigma: Annotated[bool, typer.Option("--no-sigma", help="Do not write the three sigmas of each point.")] = False,
+    error_model: Annotated[
+        bool, typer.Option("--error-model", help="Also write how the points' errors are correlated (swath accuracy).")
+    ] = False,
     copc: Annotated[bool, typer.Option("--copc", help="Write cloud-optimised files (.copc.laz).")] = False,
     scale: Annotated[
         float, typer.Option(help="Resolution of stored coordinates, in their unit.", min=1e-9, max=1.0)
@@ -90,7 +93,7 @@ def command(
     request = GeorefOptions(
         logs=logs,
         output=output,
-        trajectory=TrajectoryOptions(trajectory, week, at, force=force_trajectory),
+        trajectory=TrajectoryOptions(trajectory, week, at, navigate=error_model, force=force_trajectory),
         options=Options(
             crs=crs,
             force_crs=force_crs,
@@ -106,6 +109,7 @@ def command(
         accept_verdict=accept_verdict,
         scheduler=scheduler,
         sigmas=not no_sigma,
+        error_model=error_model,
         copc=copc,
         scale=scale,
         overwrite=overwrite,

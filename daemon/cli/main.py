@@ -78,6 +78,7 @@ COMMANDS = (
     Listed("offload", "Copy finished logs to another disk; verify each copy.", "Logs"),
     Listed("trajectory", "Compute the trajectory of logs, with accuracies.", "Products"),
     Listed("georef", "Georeference logs: one LAZ file per strip.", "Products"),
+    Listed("accuracy", "Say how sure points and their differences are.", "Products"),
     Listed("view", "Show products on one page: maps, differences, a profile.", "Products"),
     Listed("calibrate", "Estimate boresight, range offset and more.", "Calibration"),
     Listed("plan-calibration", "Predict the accuracy of a planned calibration.", "Calibration"),

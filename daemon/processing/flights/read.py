@@ -75,6 +75,7 @@ class GeorefOptions:
         overwrite: replace products of an earlier run.
         write_dropped: also write returns that are left out, flagged or in a list.
         accept_verdict: do not report an unusable verdict as a problem.
+        error_model: also write the error model of the points.
     """
 
     logs: Sequence[Path]
@@ -92,6 +93,7 @@ class GeorefOptions:
     overwrite: bool = False
     write_dropped: bool = False
     accept_verdict: bool = False
+    error_model: bool = False
 
     def record(self) -> dict[str, Any]:
         """Return the options for the sidecar, without those that do not affect the points."""

@@ -25,6 +25,8 @@ from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.log.durable import sync_file, try_sync_directory
 from swath.daemon.log.reader import Session
 from swath.daemon.processing.earlier_runs import listed_files, refuse_existing, stale_pages
+from swath.daemon.processing.error_model.build import build_model
+from swath.daemon.processing.error_model.file import ENDING, ModelFile
 from swath.daemon.processing.files import put_in_place, sha256_of
 from swath.daemon.processing.flights.read import (
     INTENSITY_FACTOR,
@@ -188,7 +190,8 @@ def _out_of_sight(request: GeorefOptions, names: Sequence[str]) -> Iterator[tupl
             sync_file(file)
         with held_interrupts():
             for one in names:
-                (output / f"{one}.json").unlink(missing_ok=True)
+                for ending in (".json", ENDING):
+                    (output / f"{one}{ending}").unlink(missing_ok=True)
                 for old in _strips(output, one):
                     old.unlink()
             for old in stale:
@@ -285,7 +288,13 @@ def _make(
     trajectories = [path for flight in flights for path in _write_trajectory(flight, partial)]
     record = run_record(flights, results, files)
     record["verdict"] = verdict_of(request, flights)
-    record |= {"logs": logs, "files": [path.name for path in trajectories], "options": request.record()}
+    models = []
+    if request.error_model:
+        tell("error model", 0, 0)
+        models.append(partial / f"{name}{ENDING}")
+        record["error_model"] = _write_model(models[0], flights, jobs, results, numbers)
+    others = [path.name for path in (*trajectories, *models)]
+    record |= {"logs": logs, "files": others, "options": request.record()}
     if stale := _stale(request.output, [flight.session.session_id for flight in flights]):
         record["warnings"].append(
             f"{request.output}: removed pages and pictures of the replaced points or trajectory: "
@@ -293,7 +302,7 @@ def _make(
         )
     sidecar = partial / f"{name}.json"
     write_sidecar(sidecar, record)
-    into_place([*done, *trajectories, sidecar])
+    into_place([*done, *trajectories, *models, sidecar])
     return Report(record, request.output / sidecar.name)
 
 
@@ -312,6 +321,19 @@ def _note_troubles(flights: Sequence[Flight], results: Sequence[JobResult]) -> N
         lines += [line for part in undecoded_lines(str(flights[0].log), count_undecoded(results)) for line in part]
         became = reasons_text(fates for result in results for fates in result.fates.values())
         refuse_nothing(flights[0].log, lines, became)
+
+
+def _write_model(
+    path: Path, flights: Sequence[Flight], jobs: Sequence[Job], results: Sequence[JobResult], numbers: dict[str, int]
+) -> dict[str, Any]:
+    """Write the error model, and return its entry of the sidecar."""
+    mapping = flights[0].setup.mapping
+    assert mapping is not None
+    built = build_model(flights, jobs, results)
+    session = flights[0].session.session_id
+    file = ModelFile(built.model, numbers, mapping.unit_m, mapping.wkt, f"swath {__version__}", session)
+    file.write(path)
+    return {"file": path.name, **built.summary()}
 
 
 def _write_trajectory(flight: Flight, folder: Path) -> list[Path]:
