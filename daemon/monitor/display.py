@@ -237,6 +237,8 @@ class Monitor:
             return f"{sign.path.name} cannot be read yet"
         own = _is_of_this_boot(sign.boot_id)  # locks of another computer may be invisible here
         if own and sign.path == self._part.path and not is_being_written(sign.path):
+            if self._part.ended:  # before it says that it waits for space, or has ended
+                return f"{sign.path.name} is complete, and no other part has begun"
             return f"the recorder of {sign.path.name} has stopped without completing the log"
         if own:
             age_s = (now_ns - self._newest_ns) * 1e-9

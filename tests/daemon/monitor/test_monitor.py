@@ -217,10 +217,15 @@ def test_without_a_recording_monitor_exits_with_2_and_gives_the_reason(tmp_path:
     run = swath("monitor", "--once", str(logs))
     assert (run.returncode, run.stdout) == (2, f"NOT RECORDING: no recording in {logs}\n")
     with Recorder(tmp_path, session_table(logs)) as recorder:
+        sign = (logs / "recording.json").read_text()
         assert recorder.stop() == 0
     code, found = once(logs)
     assert (code, found["verdict"]) == (2, "not recording")
     assert "last event: session_ended" in found["sentence"]
+    (logs / "recording.json").write_text(sign)  # as for a moment after a part is complete
+    code, found = once(logs)
+    assert (code, found["verdict"]) == (2, "not recording")
+    assert "is complete, and no other part has begun" in found["sentence"]
     with Recorder(tmp_path / "again", session_table(logs)) as recorder:
         time.sleep(1.0)
         recorder.kill()
