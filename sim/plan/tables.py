@@ -261,6 +261,9 @@ class RangeNoiseTable(Section):
     footprint: float = Field(
         0.25, ge=0.0, description="share of the footprint's depth on a slope that adds to the noise"
     )
+    drawn: bool = Field(
+        False, description="take the range of one place of the footprint, drawn anew, instead of noise by its depth"
+    )
 
 
 ScannerKind = Literal["oscillating", "polygon", "monogon", "nutating", "risley", "rosette", "vlp16", "os1"]

@@ -66,17 +66,42 @@ class Ranging:
         self._spinning = table.kind in ("vlp16", "os1", "rosette")
         self._counts = intensity or (SPINNING_HEAD if self._spinning else LINE_SCANNER)
         self._key = generator(seed, "ranging", name).integers(2**64, dtype=np.uint64)
+        self._aside = generator(seed, "footprint", name).integers(2**64, dtype=np.uint64)
         self._scale = 1.0 + 1e-6 * table.true.range_scale_ppm
         self._beam_m = _beam_corrections(table) if self._spinning else np.zeros(1)
         _check(table, f"scanner.{name}")
 
-    def measure(self, pulses: Pulses, echoes: Echoes, from_height_m: FloatArray, to_height_m: FloatArray) -> Measured:
+    def aside(self, pulses: Pulses, direction: FloatArray) -> FloatArray | None:
+        """Return (n, 3) unit vectors to one place of each pulse's footprint; None: the plan does not draw one.
+
+        Places are spread evenly over the disc of the beam's divergence about directions (n, 3).
+        """
+        if not (self._noise and self._table.range_noise.drawn):
+            return None
+        one, other = gauss(self._aside, pulses.number, 0), gauss(self._aside, pulses.number, 1)
+        length = np.hypot(one, other)  # of two normal numbers: exp(−length² / 2) is even from 0 to 1
+        radius = 0.5e-3 * self._table.divergence_mrad * np.sqrt(np.exp(-0.5 * length**2)) / np.maximum(length, 1e-300)
+        across = np.cross(direction, np.where(np.abs(direction[:, :1]) < 0.8, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
+        across /= np.linalg.norm(across, axis=1, keepdims=True)
+        moved = direction + radius[:, None] * (one[:, None] * across + other[:, None] * np.cross(direction, across))
+        drawn: FloatArray = moved / np.linalg.norm(moved, axis=1, keepdims=True)
+        return drawn
+
+    def measure(
+        self,
+        pulses: Pulses,
+        echoes: Echoes,
+        from_height_m: FloatArray,
+        to_height_m: FloatArray,
+        drawn_m: FloatArray | None = None,
+    ) -> Measured:
         """Return the measurements that the device reports.
 
         Args:
             pulses: n pulses.
             echoes: of the pulses, R slots.
             from_height_m: (n,) of the scanner, to_height_m (n, R) of the echoes, for the air.
+            drawn_m: (n, R) distances of the drawn places behind the echoes; None: noise by the footprint's depth.
 
         Returns:
             measurements in the slots of their echoes. A slot whose echo is too weak or outside the range gate has
@@ -89,7 +114,9 @@ class Ranging:
         said_m = self._model_range(range_m, intensity, pulses.channel[pulse])
         said_m = self._air.device_range(said_m, from_height_m[pulse], to_height_m[pulse, slot])
         if self._noise:
-            said_m = said_m + self._sigma_m(intensity, depth_m) * gauss(self._key, pulses.number[pulse], slot)
+            sloped_m = depth_m if drawn_m is None else np.zeros(len(depth_m))
+            said_m = said_m if drawn_m is None else said_m + drawn_m[pulse, slot]
+            said_m = said_m + self._sigma_m(intensity, sloped_m) * gauss(self._key, pulses.number[pulse], slot)
         width_ns = self._table.pulse_ns + 2e9 / LIGHT_MPS * depth_m
         there = intensity >= max(1.0, THRESHOLD * self._counts.full)
         there &= (said_m > 0.0) & (said_m >= self._table.range_min_m) & (said_m <= self._table.range_max_m)

@@ -86,7 +86,7 @@ class Scanner:
         beams = self._mounting.beams(pulses, poses, self._site)
         echoes = self._cast(pulses, beams)
         from_m, to_m = self._heights(beams, echoes)
-        measured = self._ranging.measure(pulses, echoes, from_m, to_m)
+        measured = self._ranging.measure(pulses, echoes, from_m, to_m, self._drawn(pulses, beams, echoes))
         return self._wire.units(pulses, measured, self._truth(pulses, beams, echoes))
 
     def _cast(self, pulses: Pulses, beams: Beams) -> Echoes:
@@ -99,14 +99,29 @@ class Scanner:
         beams.direction[:] = self._air.bend(beams.direction, self._down(beams.origin), from_m, ground_m)
         return self._cast_along(pulses, beams, beams.direction)
 
-    def _cast_along(self, pulses: Pulses, beams: Beams, direction: FloatArray) -> Echoes:
+    def _drawn(self, pulses: Pulses, beams: Beams, echoes: Echoes) -> FloatArray | None:
+        """Return (n, R) how much farther the surface is at a place that is drawn in the footprint; None: none is drawn.
+
+        An echo goes with the nearest one there on the same kind of surface; where there is none, it stays at the axis.
+        """
+        aside = self._ranging.aside(pulses, beams.direction)
+        if aside is None:
+            return None
+        there = self._cast_along(pulses, beams, aside, line=True)
+        apart = there.range_m[:, np.newaxis, :] - echoes.range_m[:, :, np.newaxis]
+        apart[(there.surface[:, np.newaxis, :] != echoes.surface[:, :, np.newaxis]) | np.isnan(apart)] = np.inf
+        nearest = np.take_along_axis(apart, np.abs(apart).argmin(axis=2)[:, :, np.newaxis], axis=2)[:, :, 0]
+        drawn: FloatArray = np.where(np.isfinite(nearest), nearest, 0.0)
+        return drawn
+
+    def _cast_along(self, pulses: Pulses, beams: Beams, direction: FloatArray, *, line: bool = False) -> Echoes:
         table = self._table
         return self._scene.cast(
             beams.origin,
             direction,
             pulses.time_s,
             self._first_number + pulses.number,
-            1e-3 * table.divergence_mrad,
+            0.0 if line else 1e-3 * table.divergence_mrad,
             0.5 * LIGHT_MPS * 1e-9 * table.pulse_ns,
             table.return_slots,
         )

@@ -250,3 +250,37 @@ def test_without_noise_ranges_are_exact() -> None:
 def test_impossible_values_are_refused_by_their_key(keys: dict[str, Any], error: str) -> None:
     with pytest.raises(PlanError, match=r"^scanner\.left\." + error):
         Ranging(scanner(**keys), Air(CLEAR, 1064.0), 1, "left", False)
+
+
+# ---------------------------------------------------------------------------------------------- places in the footprint
+
+
+def test_a_place_in_the_footprint_is_anywhere_on_its_disc() -> None:
+    """An evenly lit disc of 0.4 mrad has a standard deviation of a quarter of that along any axis."""
+    n = 50_000
+    direction = np.array([[0.3, -0.5, -0.81], [0.95, 0.1, -0.3]])
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    table = scanner(range_noise={"drawn": True}, divergence_mrad=0.4)
+    ranging = Ranging(table, Air(CLEAR, 1064.0), 1, "left", True)
+    for axis in direction:
+        found = ranging.aside(pulses_of(np.arange(n)), np.tile(axis, (n, 1)))
+        assert found is not None
+        np.testing.assert_allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-12)
+        apart = found - axis
+        assert np.linalg.norm(apart, axis=1).max() <= 2.0001e-4
+        across = np.cross(axis, [0.0, 0.0, 1.0])
+        across /= np.linalg.norm(across)
+        for aside in (across, np.cross(axis, across)):
+            assert abs((apart @ aside).std() / 1e-4 - 1.0) < 4 / np.sqrt(2 * n)
+            assert abs((apart @ aside).mean()) < 4e-4 / np.sqrt(n)
+    assert Ranging(scanner(), Air(CLEAR, 1064.0), 1, "left", True).aside(pulses_of(np.arange(3)), direction) is None
+    assert Ranging(table, Air(CLEAR, 1064.0), 1, "left", False).aside(pulses_of(np.arange(3)), direction) is None
+
+
+def test_the_range_of_a_drawn_place_replaces_the_noise_of_a_slope() -> None:
+    table = scanner(range_noise={"drawn": True, "sigma_m": 0.0, "footprint": 5.0}, divergence_mrad=0.4)
+    ranging = Ranging(table, Air(CLEAR, 1064.0), 1, "left", True)
+    echoes = echoes_of(np.full((4, 1), 1000.0), 0.4, 60.0)
+    drawn_m = np.array([[0.0], [0.3], [-0.7], [2.0]])
+    measured = ranging.measure(pulses_of(np.arange(4)), echoes, np.full(4, 1500.0), np.full((4, 1), 400.0), drawn_m)
+    np.testing.assert_allclose(measured.range_m, 1000.0 + drawn_m, atol=1e-9)
