@@ -24,8 +24,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from swath.georef.arrays import ByteArray, FloatArray, Int64Array, SingleArray, StructArray
+from swath.georef.arrays import ByteArray, FloatArray, Int64Array, StructArray
 from swath.georef.compiled import jit_cached
+from swath.georef.mapping.cells import Mapped
 from swath.georef.mapping.frame import Mapping, MappingError
 from swath.georef.points import Fate, Points, Rays, contiguous
 from swath.georef.return_rows import plain
@@ -48,6 +49,7 @@ class Georeferencer:
         uncertainty: computes sigmas; None: no sigmas.
         encoder_motion: of the scanner's encoder, where its calibration has a latency or torsion.
         prf_hz: pulse rate, where its calibration has range offsets by it; the attribute ``rates`` gives it by pulse.
+        with_beams, with_covariances: also give these columns of `Points`, where there are sigmas and a mapping frame.
     """
 
     def __init__(
@@ -57,8 +59,13 @@ class Georeferencer:
         uncertainty: Uncertainty | None = None,
         encoder_motion: TellsMotion | None = None,
         prf_hz: float | None = None,
+        *,
+        with_beams: bool = False,
+        with_covariances: bool = False,
     ) -> None:
         self.model, self.mapping, self.uncertainty = model, mapping, uncertainty
+        projected = mapping is not None and uncertainty is not None
+        self.with_beams, self.with_covariances = with_beams and projected, with_covariances and projected
         self.encoder_motion, self.prf_hz = encoder_motion, prf_hz
         self._mapped = False  # whether any point was mapped so far
         self.rates: PulseRates | None = None
@@ -83,7 +90,12 @@ class Georeferencer:
         if self.encoder_motion is not None and self.model.needs_encoder_motion:
             # for all rows at once: the rate at a reading depends on its neighbours
             motion = self.encoder_motion.motion(rows, time_ns)
-        points = Points.empty(len(rows), with_sigmas=self.uncertainty is not None)
+        points = Points.empty(
+            len(rows),
+            with_sigmas=self.uncertainty is not None,
+            with_beams=self.with_beams,
+            with_covariances=self.with_covariances,
+        )
         fates = np.empty(len(rows), np.uint8)
         filled = 0
         failed: MappingError | None = None
@@ -126,34 +138,37 @@ class Georeferencer:
         done = rays.fate == Fate.GEOREFERENCED
         kept, failure = rays if done.all() else rays.take(done), None
         try:
-            points_map, sigma_map = self._mapped_points(kept)
+            mapped = self._mapped_points(kept)
         except MappingError as error:
             failure = error
             assert self.mapping is not None
             reached = self.mapping.reaches(kept.points_e)
             rays.fate[np.flatnonzero(done)[~reached]] = Fate.NOT_FINITE
             done[done], kept = reached, kept.take(reached)
-            points_map, sigma_map = self._mapped_points(kept)
-        to = slice(filled, filled + len(points_map))
-        points.points_map[to] = points_map
+            mapped = self._mapped_points(kept)
+        to = slice(filled, filled + len(mapped.points_map))
+        for name, values in mapped._asdict().items():
+            if values is not None:
+                getattr(points, name)[to] = values
         columns = PointColumns(*(getattr(points, name)[to] for name in PointColumns._fields))
         rows = rows if done.all() else rows[done]
         fill_columns(contiguous(plain(rows)), kept.time_ns, kept.off_nadir_rad, kept.range_m, columns)
-        if points.sigma_map is not None:
-            points.sigma_map[to] = sigma_map
-        return len(points_map), failure
+        return len(mapped.points_map), failure
 
-    def _mapped_points(self, rays: Rays) -> tuple[FloatArray, SingleArray | None]:
-        """Return coordinates (n, 3) and sigmas along the same axes (ISO Eq. 8, 13, 14).
+    def _mapped_points(self, rays: Rays) -> Mapped:
+        """Return coordinates (n, 3), sigmas along the same axes, and what else was asked for (ISO Eq. 8, 13, 14).
 
         Raises:
             MappingError: some points have no coordinates.
         """
-        if self.mapping is not None:
-            return self.mapping.map_with_sigmas(rays.points_e, rays.covariance_e)
-        if rays.covariance_e is None:
-            return rays.points_e, None
-        return rays.points_e, np.sqrt(rays.covariance_e[:, [0, 3, 5]]).astype(np.float32)
+        covariance_e = rays.covariance_e
+        if self.mapping is None:
+            sigma_e = None if covariance_e is None else np.sqrt(covariance_e[:, [0, 3, 5]]).astype(np.float32)
+            return Mapped(rays.points_e, sigma_e)
+        if covariance_e is None:
+            return Mapped(self.mapping.map_from_e(rays.points_e))
+        origin_e = rays.origin_e if self.with_beams else None
+        return self.mapping.map_with_beams(rays.points_e, covariance_e, origin_e, whole=self.with_covariances)
 
 
 @jit_cached

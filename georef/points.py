@@ -52,6 +52,13 @@ class Points:
         return_number, number_of_returns: (n,).
         channel: (n,) beam or facet.
         mta_zone: (n,) pulses in air − 1; 255: unknown.
+        beam_map: (n, 3) change of the coordinates, in metres, with the range: the beam's direction.
+        covariance_map: (n, 6) of easting e, northing n and height h: ee en eh nn nh hh, m².
+        range_sigma_m: (n,) one sigma of the range alone.
+        incidence_rad: (n,) between the beam and the surface's normal, 0 … π/2.
+        surface: (n,) `swath.georef.surface.planes` ``LEVEL_GROUND``, ``PLANE``, ``ROUGH``: where the incidence is from.
+
+    The last five are None unless asked for; `swath.georef.surface.local` sets the last two.
     """
 
     time_ns: Int64Array
@@ -64,6 +71,11 @@ class Points:
     number_of_returns: ByteArray
     channel: NDArray[np.uint16]
     mta_zone: ByteArray
+    beam_map: SingleArray | None = None
+    covariance_map: SingleArray | None = None
+    range_sigma_m: SingleArray | None = None
+    incidence_rad: SingleArray | None = None
+    surface: ByteArray | None = None
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -76,7 +88,9 @@ class Points:
         return Points(*taken)
 
     @classmethod
-    def empty(cls, count: int, *, with_sigmas: bool) -> Points:
+    def empty(
+        cls, count: int, *, with_sigmas: bool, with_beams: bool = False, with_covariances: bool = False
+    ) -> Points:
         """Make room for n points with undefined contents."""
         return cls(
             time_ns=np.empty(count, np.int64),
@@ -89,6 +103,8 @@ class Points:
             number_of_returns=np.empty(count, np.uint8),
             channel=np.empty(count, np.uint16),
             mta_zone=np.empty(count, np.uint8),
+            beam_map=np.empty((count, 3), np.float32) if with_beams else None,
+            covariance_map=np.empty((count, 6), np.float32) if with_covariances else None,
         )
 
     @classmethod

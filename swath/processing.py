@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -36,6 +36,7 @@ from swath.daemon.processing.navigation.navigate import (
 )
 from swath.daemon.processing.points.feed import LogFeed
 from swath.daemon.processing.points.jobs import Job, JobPlan, JobResult, placed_points
+from swath.daemon.processing.points.surfaces import SurfaceSigmas
 from swath.daemon.processing.setup.setup import Options
 from swath.daemon.processing.trajectory.files import TrajectoryFiles, write_trajectory
 from swath.daemon.processing.user_errors import as_user_error
@@ -269,6 +270,7 @@ def georeference(
     strips: str = "auto",
     min_strip_s: float | None = None,
     sigmas: bool = True,
+    surface: Literal["planes", "level", "none"] = "planes",
     datum: str | None = None,
     epoch: float | None = None,
     force_crs: bool = False,
@@ -287,6 +289,7 @@ def georeference(
         scanners: names of those to use; empty: all.
         strips: auto, whole, or a CSV file of times; ``min_strip_s``: the shortest strip.
         sigmas: compute three sigmas for each point.
+        surface: what the sigmas take the beams' footprints to fall on: planes, level (ground) or none.
         datum, epoch: of the trajectory's positions, and of the products, as in `swath georef`.
         force_crs: accept a CRS that does not suit the place.
         workers: processes that write files; above 1, call it under ``if __name__ == "__main__":``.
@@ -308,6 +311,7 @@ def georeference(
             scanners=tuple(scanners),
             calibrations=_calibrations(calibration),
             uncertainty=sigmas,
+            surface=surface,
         ),
         config=log.config,
         strips=strips,
@@ -390,10 +394,14 @@ class PointCloud:
         plan = JobPlan(flight.index, flight.setup, flight.clocks.clocks)
         result = JobResult(job.session, job.segment.strip, job.segment.start_ns, job.segment.end_ns)
         feed = LogFeed(flight.setup, flight.setup.office_stream(plan.clocks, trajectory))
+        sigmas = SurfaceSigmas(flight.setup)
         for placed in placed_points(plan, job, result, feed):
             for name, points in placed:
-                if len(points):
-                    yield self._table(points, self.scanners.index(name), job.segment.strip)
+                sigmas.take(name, points)
+            for held in sigmas.ready():
+                yield self._table(held.points, self.scanners.index(held.name), job.segment.strip)
+        for held in sigmas.ready(last=True):
+            yield self._table(held.points, self.scanners.index(held.name), job.segment.strip)
         for fates in result.fates.values():
             self.fates.update(fates)
 

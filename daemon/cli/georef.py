@@ -6,7 +6,7 @@ import json
 import os
 import time
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -61,6 +61,21 @@ def command(
     error_model: Annotated[
         bool, typer.Option("--error-model", help="Also write how the points' errors are correlated (swath accuracy).")
     ] = False,
+    surface: Annotated[
+        Literal["planes", "level", "none"],
+        typer.Option(
+            help="Surface under the beams' footprints, for sigmas: planes found in the points, level ground, or none."
+        ),
+    ] = "planes",
+    incidence: Annotated[
+        bool, typer.Option("--incidence", help="Also write each point's angle of incidence, and where it is from.")
+    ] = False,
+    range_sigma: Annotated[
+        bool, typer.Option("--range-sigma", help="Also write the sigma of each point's range alone.")
+    ] = False,
+    covariances: Annotated[
+        bool, typer.Option("--covariances", help="Also write the six covariances of each point's coordinates.")
+    ] = False,
     copc: Annotated[bool, typer.Option("--copc", help="Write cloud-optimised files (.copc.laz).")] = False,
     scale: Annotated[
         float, typer.Option(help="Resolution of stored coordinates, in their unit.", min=1e-9, max=1.0)
@@ -90,6 +105,7 @@ def command(
     from swath.daemon.processing.setup.setup import Options
     from swath.georef.strips import StripRules
 
+    _refuse_columns(no_sigma, surface, incidence=incidence, range_sigma=range_sigma, covariances=covariances)
     request = GeorefOptions(
         logs=logs,
         output=output,
@@ -101,6 +117,10 @@ def command(
             epoch=epoch,
             calibrations=calibrations_given(calibration or []),
             uncertainty=not no_sigma,
+            surface=surface,
+            incidence=incidence,
+            range_sigma=range_sigma,
+            covariances=covariances,
         ),
         config=None if config is None else load_config(config),
         strips=strips,
@@ -120,6 +140,15 @@ def command(
         report = georeference(request, tell)
         elapsed_s = time.monotonic() - began_s
     _tell(report.record, report.sidecar, elapsed_s, as_json=as_json)
+
+
+def _refuse_columns(no_sigma: bool, surface: str, **columns: bool) -> None:
+    """Refuse with `UserError` columns that the other options leave without content."""
+    named = [f"--{name.replace('_', '-')}" for name, wanted in columns.items() if wanted]
+    if no_sigma and named:
+        raise UserError(f"{named[0]} needs the sigmas: leave out --no-sigma", ExitCode.USAGE)
+    if surface == "none" and columns["incidence"]:
+        raise UserError("--incidence needs a surface: use --surface planes or level", ExitCode.USAGE)
 
 
 def calibrations_given(given: list[str]) -> dict[str, tuple[str, str]]:

@@ -348,7 +348,7 @@ class ScannerConfig(Section):
     angle_sigma_deg: float = Field(
         0.001, ge=0.0, le=10.0, description="standard deviation of the beam's direction along the scan"
     )
-    divergence_mrad: float = Field(0.3, ge=0.0, le=100.0, description="full divergence angle of the beam")
+    divergence_mrad: float = Field(0.3, ge=0.0, le=100.0, description="full divergence of the beam, its wider axis")
     wavelength_nm: float | None = Field(
         None, ge=300.0, le=2000.0, description="wavelength of the laser; absent: the maker's, or 1064 if unknown"
     )

@@ -78,6 +78,7 @@ from swath.georef.records import (
 from swath.georef.scanner.beams import LineGeometry
 from swath.georef.scanner.calibration import nominal
 from swath.georef.scanner.uncertainty import Noise
+from swath.georef.surface.local import warm_up_surface
 from swath.georef.timescales.gps_time import SECOND_NS, unix_ns_from_gps, week_from_gps
 from swath.georef.trajectory.trajectory import Trajectory
 
@@ -185,7 +186,7 @@ def warm_up(setups: Iterable[Setup] = (), *, calibration: bool = False, tell: Te
 
 def _setup(plan: str, uncertainty: bool) -> Setup:
     config = Config(Tables.model_validate(tomllib.loads(plan)), Path("warm-up.toml"), plan)
-    return Setup(config, {}, Options(uncertainty=uncertainty))
+    return Setup(config, {}, Options(uncertainty=uncertainty, covariances=uncertainty))
 
 
 def get_ready(setup: Setup) -> None:
@@ -248,6 +249,9 @@ def _warm_products(points: Points) -> None:
     grid.add(Points.empty(1, with_sigmas=False), np.zeros(3), np.ones(3), places=np.zeros((1, 3)))
     grid.numbers()
     sigmas = points.sigma_map is not None
+    if points.beam_map is not None and len(points):
+        for level in (True, False):
+            warm_up_surface(points, level=level)
     middle = points.points_map.mean(axis=0) if len(points) else np.zeros(3)
     writer = LasWriter(io.BytesIO(), LasSettings("", tuple(np.round(middle).tolist()), sigmas=sigmas), 1)
     if len(points):

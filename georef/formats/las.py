@@ -17,7 +17,17 @@ from numpy.typing import NDArray
 
 from swath.georef.arrays import ByteArray, FloatArray, Int64Array, SingleArray, StructArray
 from swath.georef.compiled import jit_cached, jit_inline
-from swath.georef.formats.las_header import POINT_FORMAT, SIGMA_SCALE_M, LasHeader
+from swath.georef.formats.las_header import (
+    COVARIANCE_FIELDS,
+    INCIDENCE_FIELDS,
+    INCIDENCE_SCALE_DEG,
+    POINT_FORMAT,
+    RANGE_SIGMA_FIELDS,
+    SIGMA_FIELDS,
+    SIGMA_SCALE_M,
+    LasHeader,
+    point_dtype,
+)
 from swath.georef.points import Points
 
 ADJUSTED_GPS_EPOCH_S = 1_000_000_000
@@ -44,6 +54,8 @@ class LasSettings:
         offset: (3,) easting, northing, height near the points.
         scale: (3,) unit of the coordinates' integers, in the units of the coordinate system.
         sigmas: whether three sigmas follow each point, uint16 of 0.1 mm.
+        incidence, range_sigma, covariances: whether these follow too: incidence and kind of surface, the range's sigma,
+            six covariances.
         creation_date: date of the flight.
         software, system_identifier: names for the header.
         provenance: see `LasHeader`.
@@ -53,6 +65,9 @@ class LasSettings:
     offset: tuple[float, float, float]
     scale: tuple[float, float, float] = (0.001, 0.001, 0.001)
     sigmas: bool = True
+    incidence: bool = False
+    range_sigma: bool = False
+    covariances: bool = False
     creation_date: dt.date = dt.date(1980, 1, 6)
     software: str = "swath"
     system_identifier: str = ""
@@ -60,10 +75,16 @@ class LasSettings:
 
     def header(self, strip: int) -> LasHeader:
         """Return the header of a strip's file."""
+        asked = (
+            (self.sigmas, SIGMA_FIELDS),
+            (self.incidence, INCIDENCE_FIELDS),
+            (self.range_sigma, RANGE_SIGMA_FIELDS),
+            (self.covariances, COVARIANCE_FIELDS),
+        )
         return LasHeader(
             scale=np.array(self.scale),
             offset=np.array(self.offset),
-            sigmas=self.sigmas,
+            extra=tuple(field for wanted, fields in asked if wanted for field in fields),
             wkt=self.wkt,
             creation_date=self.creation_date,
             software=self.software,
@@ -102,6 +123,10 @@ class PointPacker:
         self._per_unit = 1.0 / header.scale
         self._clipped = np.zeros(3, np.int64)
         self._records = np.zeros(BLOCK, header.dtype)
+        self._extra = frozenset(field.name for field in header.extra)
+        usual = tuple(field for field in header.extra if field in SIGMA_FIELDS)
+        self._more = len(usual) < len(header.extra)
+        self._usual = np.zeros(BLOCK, point_dtype(usual)) if self._more else self._records  # as the loops know them
 
     @property
     def clipped(self) -> Clipped:
@@ -117,7 +142,7 @@ class PointPacker:
             LasError: coordinates are beyond the range of the scale.
         """
         last = min(first + BLOCK, len(points))
-        records = self._records[: last - first]
+        records = self._usual[: last - first]
         flags = (_WITHHELD if withheld else 0) | min(scanner, MAX_SCANNER_CHANNEL) << 4
         head = self.header
         wrong = _pack(
@@ -127,11 +152,36 @@ class PointPacker:
         )  # fmt: skip
         if wrong >= 0:
             raise LasError(self._out_of_bounds(points.points_map[wrong]))
-        if head.sigmas:
+        if "sigma_easting" in self._extra:
             if points.sigma_map is None:
                 raise LasError("the points have no sigmas, but the file stores sigmas; open it with sigmas=False")
             _pack_sigmas(records, first, points.sigma_map, self._clipped)
+        if self._more:
+            records = self._with_more(records, points, slice(first, last))
         head.count += len(records)
+        return records
+
+    def _with_more(self, usual: StructArray, points: Points, rows: slice) -> StructArray:
+        """Return records with the columns that are rarely asked for; an incidence that is not a number becomes 0."""
+        n, size = len(usual), usual.dtype.itemsize
+        records = self._records[:n]
+        records.view(np.uint8).reshape(n, -1)[:, :size] = usual.view(np.uint8).reshape(n, size)
+        if "incidence_angle" in self._extra:
+            if points.incidence_rad is None or points.surface is None:
+                raise LasError("the points have no incidence, but the file stores it; open it with incidence=False")
+            angle = np.degrees(points.incidence_rad[rows]) / INCIDENCE_SCALE_DEG
+            records["incidence_angle"], records["surface"] = np.rint(np.nan_to_num(angle)), points.surface[rows]
+        if "sigma_range" in self._extra:
+            if points.range_sigma_m is None:
+                raise LasError("the points have no range sigma, but the file stores it; open it with range_sigma=False")
+            records["sigma_range"] = np.rint(np.minimum(points.range_sigma_m[rows] / SIGMA_SCALE_M, 65535.0))
+        if "covariance_ee" in self._extra:
+            if points.covariance_map is None:
+                raise LasError(
+                    "the points have no covariances, but the file stores them; open it with covariances=False"
+                )
+            for column, field in enumerate(COVARIANCE_FIELDS):
+                records[field.name] = points.covariance_map[rows, column]
         return records
 
     def _out_of_bounds(self, point: FloatArray) -> str:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import datetime as dt
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +23,7 @@ _HEADER = struct.Struct("<4sHH16sBB32s32sHHHIIBHI5I3d3d6dQQIQ15Q")
 _VLR = struct.Struct("<H16sHH32s")
 _EVLR = struct.Struct("<H16sHQ32s")
 _EXTRA_BYTES = struct.Struct("<2xBB32s4x24x24x24xd16x24x32s")
-_UINT16, _SCALED = 3, 1 << 3
+_UINT8, _UINT16, _FLOAT, _SCALED = 1, 3, 9, 1 << 3
 _COPC_INFO = struct.Struct("<5dQQ2d88x")
 
 # Bytes of a point as a file holds them; the fields of format 6 come first.
@@ -38,10 +40,33 @@ _POINT_FIELDS = [
     ("point_source_id", "<u2"),
     ("gps_time", "<f8"),
 ]
-_SIGMA_FIELDS = [("sigma_easting", "<u2"), ("sigma_northing", "<u2"), ("sigma_height", "<u2")]
-POINT_DTYPE = np.dtype(_POINT_FIELDS)
-SIGMA_POINT_DTYPE = np.dtype(_POINT_FIELDS + _SIGMA_FIELDS)
 SIGMA_SCALE_M = 1e-4
+INCIDENCE_SCALE_DEG = 0.01
+
+
+class ExtraByte(NamedTuple):
+    """A field that follows a point: its name, type in NumPy and in LAS, scale (0: none), and description."""
+
+    name: str
+    dtype: str
+    type: int
+    scale: float
+    description: str
+
+
+SIGMA_FIELDS = tuple(
+    ExtraByte(name, "<u2", _UINT16, SIGMA_SCALE_M, "one sigma, m; 6.5535: or more")
+    for name in ("sigma_easting", "sigma_northing", "sigma_height")
+)
+INCIDENCE_FIELDS = (
+    ExtraByte("incidence_angle", "<u2", _UINT16, INCIDENCE_SCALE_DEG, "beam to the normal, degrees"),
+    ExtraByte("surface", "u1", _UINT8, 0.0, "1: level, 2: plane, 3: rough"),
+)
+RANGE_SIGMA_FIELDS = (ExtraByte("sigma_range", "<u2", _UINT16, SIGMA_SCALE_M, "one sigma, m; 6.5535: or more"),)
+COVARIANCE_FIELDS = tuple(
+    ExtraByte(f"covariance_{axes}", "<f4", _FLOAT, 0.0, "m2; e, n, h: the axes")
+    for axes in ("ee", "en", "eh", "nn", "nh", "hh")
+)
 
 
 @dataclass(slots=True)
@@ -50,7 +75,7 @@ class LasHeader:
 
     Attributes:
         scale, offset: (3,) coordinates = integer · scale + offset.
-        sigmas: whether three sigmas follow each point.
+        extra: fields that follow each point.
         wkt: coordinate system.
         creation_date: of the file; here the date of the flight, so that the same input gives the same bytes.
         system_identifier, software: at most 32 bytes are kept.
@@ -61,7 +86,7 @@ class LasHeader:
 
     scale: FloatArray
     offset: FloatArray
-    sigmas: bool
+    extra: tuple[ExtraByte, ...]
     wkt: str
     creation_date: dt.date
     system_identifier: str = ""
@@ -78,7 +103,7 @@ class LasHeader:
     @property
     def dtype(self) -> np.dtype[np.void]:
         """The record type of a point."""
-        return SIGMA_POINT_DTYPE if self.sigmas else POINT_DTYPE
+        return point_dtype(self.extra)
 
     @property
     def bounds(self) -> FloatArray:
@@ -97,8 +122,8 @@ class LasHeader:
         """
         vlrs = first_vlrs + encode_vlr("LASF_Projection", 2112, _terminated(self.wkt), "OGC WKT coordinate system")
         count = first_count + 2
-        if self.sigmas:
-            vlrs += encode_vlr("LASF_Spec", 4, _sigma_records(), "extra bytes")
+        if self.extra:
+            vlrs += encode_vlr("LASF_Spec", 4, b"".join(map(_extra_record, self.extra)), "extra bytes")
             count += 1
         if self.provenance:
             vlrs += encode_vlr("swath", 1, self.provenance.encode(), "provenance, JSON")
@@ -135,6 +160,11 @@ class LasHeader:
         return head + vlrs
 
 
+def point_dtype(extra: Sequence[ExtraByte]) -> np.dtype[np.void]:
+    """Return the record type of a point with fields that follow it."""
+    return np.dtype(_POINT_FIELDS + [(field.name, field.dtype) for field in extra])
+
+
 def encode_vlr(user_id: str, record_id: int, data: bytes, description: str) -> bytes:
     """Return a variable length record.
 
@@ -166,7 +196,6 @@ def _terminated(text: str) -> bytes:
     return text.encode() + b"\0"
 
 
-def _sigma_records() -> bytes:
-    axes = [name for name, _ in _SIGMA_FIELDS]
-    description = b"one sigma, m; 6.5535: or more"
-    return b"".join(_EXTRA_BYTES.pack(_UINT16, _SCALED, name.encode(), SIGMA_SCALE_M, description) for name in axes)
+def _extra_record(field: ExtraByte) -> bytes:
+    options = _SCALED if field.scale else 0
+    return _EXTRA_BYTES.pack(field.type, options, field.name.encode(), field.scale, field.description.encode())

@@ -11,6 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +73,15 @@ _CROSS = {
 }
 
 
+class Mapped(NamedTuple):
+    """Coordinates (n, 3), sigmas (n, 3), directions of beams (n, 3), covariances (n, 6); None: not asked for."""
+
+    points_map: FloatArray
+    sigma_map: SingleArray | None = None
+    beam_map: SingleArray | None = None
+    covariance_map: SingleArray | None = None
+
+
 class MapCells:
     """The cubes made so far, for one map.
 
@@ -101,11 +111,29 @@ class MapCells:
 
         Covariances are (n, 6) in e, xx xy xz yy yz zz.
         """
-        mapped, sigmas = np.empty((len(points_e), 3)), np.empty((len(points_e), 3), dtype=np.float32)
-        for block in _blocks(len(points_e)):
+        mapped = self.map_with_beams(points_e, covariance_e, None)
+        assert mapped.sigma_map is not None
+        return mapped.points_map, mapped.sigma_map
+
+    def map_with_beams(
+        self, points_e: FloatArray, covariance_e: FloatArray, origin_e: FloatArray | None, *, whole: bool = False
+    ) -> Mapped:
+        """Return `map` with sigmas; the directions of beams from origins (n, 3), if given; covariances, if ``whole``.
+
+        Covariances are (n, 6) in e, xx xy xz yy yz zz.
+        """
+        n = len(points_e)
+        mapped, sigmas = np.empty((n, 3)), np.empty((n, 3), dtype=np.float32)
+        beams = None if origin_e is None else np.empty((n, 3), dtype=np.float32)
+        covariances = np.empty((n, 6), dtype=np.float32) if whole else None
+        for block in _blocks(n):
             nodes = self._expand(points_e[block], mapped[block])
             _project(nodes, covariance_e[block], self._rows, self._unit_m, sigmas[block])
-        return mapped, sigmas
+            if beams is not None and origin_e is not None:
+                _aim(nodes, origin_e[block], points_e[block], self._rows, self._unit_m, beams[block])
+            if covariances is not None:
+                _project_whole(nodes, covariance_e[block], self._rows, self._unit_m, covariances[block])
+        return Mapped(mapped, sigmas, beams, covariances)
 
     def _expand(self, points: FloatArray, out: FloatArray) -> NDArray[np.int32]:
         """Fill ``out`` with coordinates, and return the cubes of the points."""
@@ -382,3 +410,58 @@ def _project(
         sigmas[i, 0] = _sigma(row, 0, xx, xy, xz, yy, yz, zz) * unit_m[0]
         sigmas[i, 1] = _sigma(row, 1, xx, xy, xz, yy, yz, zz) * unit_m[1]
         sigmas[i, 2] = _sigma(row, 2, xx, xy, xz, yy, yz, zz) * unit_m[2]
+
+
+@jit_inline
+def _gradient(row: FloatArray, j: int, unit_m: float) -> tuple[float, float, float]:
+    """Return the first derivatives of coordinate j, in metres per metre."""
+    at = np.uint64(7 + 3 * j)
+    return row[at] * unit_m, row[at + np.uint64(1)] * unit_m, row[at + np.uint64(2)] * unit_m
+
+
+@jit_cached
+def _aim(
+    nodes: NDArray[np.int32],
+    origin: FloatArray,
+    points: FloatArray,
+    rows: FloatArray,
+    unit_m: FloatArray,
+    beams: SingleArray,
+) -> None:
+    """Compute the change of map coordinates, in metres, along unit vectors from origins to points."""
+    for i in range(len(nodes)):
+        if nodes[i] < 0:
+            beams[i, 0] = beams[i, 1] = beams[i, 2] = np.nan
+            continue
+        x, y, z = points[i, 0] - origin[i, 0], points[i, 1] - origin[i, 1], points[i, 2] - origin[i, 2]
+        per = 1.0 / math.sqrt(x * x + y * y + z * z)
+        row = rows[np.uint64(nodes[i])]
+        for j in range(3):
+            a, b, c = _gradient(row, j, unit_m[j] * per)
+            beams[i, j] = a * x + b * y + c * z
+
+
+@jit_cached
+def _project_whole(
+    nodes: NDArray[np.int32],
+    covariance: FloatArray,
+    rows: FloatArray,
+    unit_m: FloatArray,
+    out: SingleArray,
+) -> None:
+    """Compute G Σ Gᵀ, G the first derivatives of the map, as ee en eh nn nh hh; nan beyond the reach of cubes."""
+    for i in range(len(nodes)):
+        if nodes[i] < 0:
+            out[i, :] = np.nan
+            continue
+        row = rows[np.uint64(nodes[i])]
+        xx, xy, xz = covariance[i, 0], covariance[i, 1], covariance[i, 2]
+        yy, yz, zz = covariance[i, 3], covariance[i, 4], covariance[i, 5]
+        at = 0
+        for j in range(3):
+            a, b, c = _gradient(row, j, unit_m[j])
+            x, y, z = xx * a + xy * b + xz * c, xy * a + yy * b + yz * c, xz * a + yz * b + zz * c
+            for k in range(j, 3):
+                a, b, c = _gradient(row, k, unit_m[k])
+                out[i, at] = a * x + b * y + c * z
+                at += 1

@@ -21,7 +21,7 @@ from pyproj.exceptions import CRSError
 from swath.georef.arrays import BoolArray, FloatArray, SingleArray
 from swath.georef.geodesy.earth import geodetic_from_e
 from swath.georef.map_fit import degrees_text, misfit_of, outside_deg
-from swath.georef.mapping.cells import APPROXIMATION_M, ROOT_M, MapCells
+from swath.georef.mapping.cells import APPROXIMATION_M, ROOT_M, MapCells, Mapped
 from swath.georef.mapping.datums import (
     ACCURACY_M,
     OUTPUT,
@@ -178,9 +178,20 @@ class Mapping:
         """
         if covariance_e is None:
             return self.map_from_e(points_e), None
+        mapped = self.map_with_beams(points_e, covariance_e, None)
+        return mapped.points_map, mapped.sigma_map
+
+    def map_with_beams(
+        self, points_e: FloatArray, covariance_e: FloatArray, origin_e: FloatArray | None, *, whole: bool = False
+    ) -> Mapped:
+        """Return `map_with_sigmas`; the directions of beams from origins (n, 3) in e, if given; and, if ``whole``,
+        covariances (n, 6) along the same axes as the sigmas, m².
+        """
         points = np.ascontiguousarray(points_e, dtype=np.float64)
         self._settle_by_first(points)
-        return self._cells.map_with_sigmas(points, np.ascontiguousarray(covariance_e, dtype=np.float64))
+        origins = None if origin_e is None else np.ascontiguousarray(origin_e, dtype=np.float64)
+        covariance_e = np.ascontiguousarray(covariance_e, dtype=np.float64)
+        return self._cells.map_with_beams(points, covariance_e, origins, whole=whole)
 
     def reaches(self, points_e: FloatArray) -> BoolArray:
         """Return whether `map_from_e` has coordinates for each of positions in e (n, 3), without raising for any.

@@ -102,10 +102,10 @@ class Flown:
         return Path(shutil.copy(self.log, folder))
 
 
-def fly(folder: Path) -> Flown:
+def fly(folder: Path, text: str = PLAN) -> Flown:
     """Fly the plan into a folder."""
     plan = folder / "line.toml"
-    plan.write_text(PLAN)
+    plan.write_text(text)
     assert run_app(["sim", "fly", str(plan), "-o", str(folder / "flight")]) == 0
     flown = Flown(folder / "flight")
     flown.sbet.write_bytes(sbet_bytes(flown.trajectory()))

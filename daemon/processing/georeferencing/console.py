@@ -41,6 +41,8 @@ def georef_lines(record: Mapping[str, Any], elapsed_s: float) -> Iterator[str]:
         name = f" of {flight['session']}" if len(flights) > 1 else ""
         yield f"trajectory{name}: {trajectory_words(flight['trajectory'])}"
     yield f"CRS: {crs_line(record['crs'])}"
+    if record["surface"] is not None:
+        yield f"surface for the sigmas: {surface_words(record['surface'])}"
     yield _density_line(record["totals"])
     yield _time_line(record, elapsed_s)
 
@@ -80,6 +82,16 @@ def trajectory_words(trajectory: Mapping[str, Any]) -> str:
     levels = [one["level"] for one in trajectory["verdict"]]
     words.append(f"{levels[0]}, see above" if levels else "no doubts")
     return "; ".join(words)
+
+
+def surface_words(surface: Mapping[str, Any]) -> str:
+    """Return what the sigmas took the footprints to fall on."""
+    points = surface["points"]
+    total = points["planes"] + points["level_ground"] + points["rough"]
+    if surface["kind"] != "planes" or not total:
+        return "none" if not total else "level ground"
+    planes, level, rough = (number(100.0 * points[key] / total, ".3g") for key in ("planes", "level_ground", "rough"))
+    return f"planes under {planes} % of the points, none under {rough} %, too few points to tell under {level} %"
 
 
 def crs_line(crs: Mapping[str, Any]) -> str:

@@ -16,10 +16,12 @@ from swath import __version__
 from swath.daemon.processing.carried_verdict import trajectory_entry
 from swath.daemon.processing.files import utc_text, write_whole
 from swath.daemon.processing.points.coverage import area_of_all_m2
+from swath.daemon.processing.points.surfaces import SURFACES
 from swath.daemon.processing.setup.models import air_of
 from swath.daemon.processing.undecoded import undecoded_lines
 from swath.georef.points import Fate
 from swath.georef.scanner.calibration import PARAMETERS
+from swath.georef.surface.local import Surface
 
 if TYPE_CHECKING:
     from swath.daemon.processing.flights.read import Flight
@@ -39,6 +41,12 @@ CARRIED = (
 )  # entries of a calibration's header
 SIGMAS = ("north_m", "east_m", "down_m", "roll_deg", "pitch_deg", "heading_deg")
 IN_FILES = Fate.GEOREFERENCED.name.lower()
+ASSUMED: dict[Surface, str] = {
+    "planes": "planes in the points around each point; where there are too few points, level ground; where they lie "
+    "on no plane, level ground and a slope as rough as they are",
+    "level": "level ground",
+    "none": "none: sigmas are those of a surface that each beam meets at a right angle",
+}
 UNCOVERED = {"outside_trajectory": "are outside the trajectory", "trajectory_gap": "are in gaps of the trajectory"}
 
 
@@ -119,6 +127,7 @@ def strip_entry(result: JobResult, file: Path | None, dropped: Path | None) -> d
         "last_returns": result.last_returns,
         **_density_entry(result.points, result.last_returns, None if (on := result.covered) is None else on.area_m2),
         "counts": {scanner: counts_entry(fates) for scanner, fates in sorted(result.fates.items())},
+        "surface": dict(sorted(result.surface.items())),
         "clipped": {
             "sigma_above_6.5535_m": result.clipped.sigma,
             "sigma_unknown": result.clipped.sigma_unknown,
@@ -141,6 +150,18 @@ def totals_entry(results: Sequence[JobResult]) -> dict[str, Any]:
     known = all(one.covered is not None for one in strips)
     area_m2 = area_of_all_m2(one.covered for one in strips) if known else None
     return {"points": points, "last_returns": last, "strips": len(strips)} | _density_entry(points, last, area_m2)
+
+
+def surface_entry(setup: Setup, results: Sequence[JobResult]) -> dict[str, Any] | None:
+    """Return what the sigmas took the footprints to fall on, and numbers of points by it; None: there are no sigmas."""
+    if not setup.options.uncertainty:
+        return None
+    points: Counter[str] = Counter()
+    for result in results:
+        for counts in result.surface.values():
+            points.update({key: counts[key] for key in SURFACES})
+    kind = setup.options.surface
+    return {"kind": kind, "assumed": ASSUMED[kind], "points": {key: points[key] for key in SURFACES}}
 
 
 def quality_entry(flight: Flight) -> dict[str, Any]:
@@ -184,6 +205,7 @@ def run_record(
         "crs": mapping.description(),
         "counts": count_fates(results),
         "totals": totals_entry(results),
+        "surface": surface_entry(flights[0].setup, results),
         "strips": strips,
         "flights": [_flight_entry(flight, _of(results, flight, flights)) for flight in flights],
     }

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import BinaryIO, Protocol
+from typing import Any, BinaryIO, Protocol
 
 import lazrs
 import numpy as np
@@ -29,6 +29,7 @@ from swath.daemon.log.reader import PartDamage
 from swath.daemon.processing.points.coverage import Coverage, Covered
 from swath.daemon.processing.points.discarded import DiscardedPoints
 from swath.daemon.processing.points.feed import LogFeed
+from swath.daemon.processing.points.surfaces import SurfaceSigmas
 from swath.daemon.processing.setup.setup import Setup
 from swath.daemon.processing.undecoded import Undecoded
 from swath.georef.formats.copc import CopcWriter
@@ -125,6 +126,7 @@ class JobResult:
         covered: ground that the points lie on; None: not known.
         edges: by scanner, for the sampled point seen farthest from nadir: the angle, rad, the height of the scanner
             above the point, m, and the point's ellipsoidal height, m.
+        surface: by scanner, `swath.daemon.processing.points.surfaces.SurfaceSigmas.counts`.
         file_bytes: size of the file written.
         withheld, listed: number of returns left out that are withheld points of the file, and rows of the list.
         failed: why the job failed; empty: it did not.
@@ -148,6 +150,7 @@ class JobResult:
     last_returns: int = 0
     covered: Covered | None = None
     edges: dict[str, tuple[float, float, float]] = field(default_factory=dict)
+    surface: dict[str, dict[str, Any]] = field(default_factory=dict)
     file_bytes: int = 0
     damage: list[PartDamage] = field(default_factory=list)
     failed: str = ""
@@ -210,32 +213,37 @@ def _write(
 ) -> None:
     setup = plan.setup
     georeferenced = setup.office_stream(plan.clocks, trajectory)
-    feed = LogFeed(setup, georeferenced)
-
-    def put(name: str, points: Points, *, withheld: bool = False) -> None:
-        factor = plan.intensity_factors.get(name, 1.0)
-        sink.write(points, scanner=plan.numbers[name], intensity_factor=factor, withheld=withheld)
-
+    feed, sigmas = LogFeed(setup, georeferenced), SurfaceSigmas(setup)
     coverage = (
         None if setup.mapping is None or setup.mapping.is_geocentric else Coverage(float(setup.mapping.unit_m[0]))
     )
 
-    def write(placed: list[tuple[str, Points]]) -> None:
-        for name, points in placed:
-            put(name, points)
+    def put(*, last: bool = False) -> None:
+        for name, points, withheld in sigmas.ready(last=last):
+            factor = plan.intensity_factors.get(name, 1.0)
+            sink.write(points, scanner=plan.numbers[name], intensity_factor=factor, withheld=withheld)
+            if withheld:
+                continue
             result.last_returns += int(np.count_nonzero(points.return_number == points.number_of_returns))
             if coverage is not None:
                 coverage.add(points.points_map[:, 0], points.points_map[:, 1])
             _note_span(result, points)
             _note_edge(result, name, points, setup, trajectory)
 
+    def take(placed: list[tuple[str, Points]]) -> None:
+        for name, points in placed:
+            sigmas.take(name, points)
+        put()
+
     dropped_file = None
     if job.discarded is not None:
-        dropped_file = DiscardedPoints(job.discarded, georeferenced, partial(put, withheld=True))
+        dropped_file = DiscardedPoints(job.discarded, georeferenced, partial(sigmas.take, withheld=True))
         opened.callback(dropped_file.close)
-    feed_job(plan, job, result, feed, write, tell)
+    feed_job(plan, job, result, feed, take, tell)
+    put(last=True)
     sink.close()
     result.clipped = sink.clipped
+    result.surface = sigmas.counts()
     result.covered = None if coverage is None else coverage.covered()
     if dropped_file is not None:
         result.withheld, result.listed = dropped_file.withheld, dropped_file.rows

@@ -56,6 +56,8 @@ def make_georeferencer(
     *,
     uncertainty: bool,
     angles: ByName[str, AngleSeries] | None = MappingProxyType({}),
+    with_beams: bool = False,
+    with_covariances: bool = False,
 ) -> Georeferencer:
     """Return the georeferencer of a scanner's returns.
 
@@ -68,6 +70,7 @@ def make_georeferencer(
         mapping: mapping of the points; None: they stay in e.
         uncertainty: True to compute sigmas.
         angles: angles of the gimbal's stages, by the source that logged them; None: they have not been read yet.
+        with_beams, with_covariances: of `Georeferencer`.
 
     Raises:
         ValueError: a setting is invalid; one line.
@@ -87,9 +90,15 @@ def make_georeferencer(
         mount_of(table.gimbal, angles),
         air_of(config, table),
     )
-    noise = Noise(table.range_sigma_m, np.radians(table.angle_sigma_deg), divergence_rad=1e-3 * table.divergence_mrad)
-    sigmas = Uncertainty(calibration, noise, aimed=model.aimed) if uncertainty else None
-    return Georeferencer(model, mapping, sigmas, GivenMotion() if model.needs_encoder_motion else None)
+    sigmas = Uncertainty(calibration, noise_of(table), aimed=model.aimed) if uncertainty else None
+    motion = GivenMotion() if model.needs_encoder_motion else None
+    return Georeferencer(model, mapping, sigmas, motion, with_beams=with_beams, with_covariances=with_covariances)
+
+
+def noise_of(table: ScannerConfig) -> Noise:
+    """Return the noise of a scanner's returns, by its table."""
+    angle_rad = float(np.radians(table.angle_sigma_deg))
+    return Noise(table.range_sigma_m, angle_rad, divergence_rad=1e-3 * table.divergence_mrad)
 
 
 def geometry_of(table: ScannerConfig, parser: Parser, fibres: bytes | None = None) -> Geometry:

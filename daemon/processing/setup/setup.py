@@ -38,6 +38,7 @@ from swath.georef.scanner.calibration import Calibration, CalibrationError, nomi
 from swath.georef.scanner.mount import AngleSeries
 from swath.georef.stream.clocks import DevicePlan, FrozenClocks, StreamClocks
 from swath.georef.stream.stream import CompletePath, GrowingPath, ScannerChain, Stream, StreamSettings
+from swath.georef.surface.local import Surface
 from swath.georef.text_encoding import decoded
 from swath.georef.timescales.gps_time import SECOND_NS
 from swath.georef.trajectory.buffer import TrajectoryBuffer
@@ -58,6 +59,8 @@ class Options:
         scanners: scanners to use; empty: all.
         calibrations: text of a calibration file and its name, by scanner; they override the configuration's.
         uncertainty: compute sigmas with the points.
+        surface: what the sigmas take the beams' footprints to fall on.
+        incidence, range_sigma, covariances: compute these with the points too; they need ``uncertainty``.
         terrain: terrain model that gives the zone of pulses in air; None: the preceding returns do.
         height_above_ground_m: height at the first return, for pulses in air without a terrain model.
     """
@@ -69,6 +72,10 @@ class Options:
     scanners: tuple[str, ...] = ()
     calibrations: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     uncertainty: bool = True
+    surface: Surface = "planes"
+    incidence: bool = False
+    range_sigma: bool = False
+    covariances: bool = False
     terrain: CoarseTerrain | None = None
     height_above_ground_m: float | None = None
 
@@ -257,9 +264,17 @@ class Setup:
                 self.mapping,
                 uncertainty=self.options.uncertainty,
                 angles=angles,
+                with_beams=self._needs_surface(name),
+                with_covariances=self.options.covariances,
             )
         except ValueError as error:
             raise ConfigError(f"scanner.{name}: {error}") from error
+
+    def _needs_surface(self, name: str) -> bool:
+        """Return whether anything that is wanted of a scanner's points depends on the surface."""
+        if self.options.surface == "none" or not self.options.uncertainty:
+            return False
+        return self.options.incidence or self.config.scanner[name].divergence_mrad > 0.0
 
     def _mapping(self) -> MappingFrame | None:
         output = self.config.output

@@ -432,7 +432,8 @@ def test_georef_ends_with_calibration_trajectory_crs_density_and_time(
     capsys.readouterr()
     assert run_app(flown.arguments(tmp_path / "points")) == 0
     lines, told = capsys.readouterr().out.splitlines(), record(tmp_path / "points")
-    calibration, trajectory, crs, density, seconds = lines[-6:-1]
+    calibration, trajectory, crs, surface, density, seconds = lines[-7:-1]
+    assert surface.startswith("surface for the sigmas: planes under ")
     (entry,) = told["flights"][0]["calibrations"].values()
     assert calibration == f"calibration: {entry['id']} of left, made {entry['created'][:10]}, {entry['verdict']}"
     sizes = r"sigmas [\d.]+\s.m in plan, [\d.]+\s.m in height, .*° roll and pitch, .*° heading"

@@ -129,6 +129,28 @@ def test_bytes_do_not_depend_on_how_points_are_divided() -> None:
     assert written(points)[0] == whole
 
 
+def test_columns_that_are_asked_for_are_read_back() -> None:
+    points, rng = made(70_000), np.random.default_rng(6)
+    points.incidence_rad = rng.uniform(0.0, np.pi / 2, len(points)).astype(np.float32)
+    points.surface = rng.integers(1, 4, len(points)).astype(np.uint8)
+    points.range_sigma_m = rng.uniform(0.01, 7.0, len(points)).astype(np.float32)
+    points.covariance_map = rng.normal(0.0, 1e-3, (len(points), 6)).astype(np.float32)
+    settings = replace(SETTINGS, incidence=True, range_sigma=True, covariances=True)
+    las = read(written(points, settings, cuts=(40_000,))[0])
+    names = ["covariance_ee", "covariance_en", "covariance_eh", "covariance_nn", "covariance_nh", "covariance_hh"]
+    assert list(las.point_format.extra_dimension_names) == [
+        "sigma_easting", "sigma_northing", "sigma_height", "incidence_angle", "surface", "sigma_range", *names,
+    ]  # fmt: skip
+    assert np.abs(las["incidence_angle"] - np.degrees(points.incidence_rad.astype(np.float64))).max() <= 0.0051
+    assert np.array_equal(las["surface"], points.surface)
+    assert np.abs(las["sigma_range"] - np.minimum(points.range_sigma_m, 6.5535)).max() <= 5.1e-5
+    assert np.array_equal(np.stack([las[name] for name in names], axis=1), points.covariance_map)
+    assert np.abs(las["sigma_height"] - points.sigma_map[:, 2]).max() <= 5.1e-5  # type: ignore[index]
+    for name, wanted in {"incidence": "incidence", "range_sigma": "range sigma", "covariances": "covariances"}.items():
+        with pytest.raises(LasError, match=f"have no {wanted}"):
+            written(made(10), replace(SETTINGS, **{name: True}))  # type: ignore[arg-type]
+
+
 def test_a_file_without_sigmas_has_no_extra_bytes() -> None:
     las = read(written(made(100, sigmas=False), replace(SETTINGS, sigmas=False))[0])
     assert list(las.point_format.extra_dimension_names) == []

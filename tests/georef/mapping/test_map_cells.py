@@ -166,6 +166,16 @@ def test_sigmas_follow_the_law_of_propagation() -> None:
     jacobian = made._rows[made._locate(points)[0], map_cells.FIRST].reshape(3, 3)
     expected = 0.5 * np.sqrt(np.einsum("ij,njk,ik->ni", jacobian, full, jacobian))
     np.testing.assert_allclose(made.map_with_sigmas(points, packed)[1], expected, rtol=1e-6)
+    origins = points + random.normal(size=(50, 3)) * 300.0
+    _, sigmas, beams, covariances = made.map_with_beams(points, packed, origins, whole=True)
+    assert sigmas is not None
+    assert beams is not None
+    assert covariances is not None
+    np.testing.assert_allclose(sigmas, expected, rtol=1e-6)
+    whole = 0.25 * np.einsum("ij,njk,lk->nil", jacobian, full, jacobian)[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+    np.testing.assert_allclose(covariances, whole, rtol=1e-5, atol=1e-9)
+    along = (points - origins) / np.linalg.norm(points - origins, axis=1, keepdims=True)
+    np.testing.assert_allclose(beams, 0.5 * along @ jacobian.T, rtol=1e-6, atol=1e-7)
 
 
 def test_the_admission_callback_is_called_once_for_each_root_cube() -> None:
