@@ -6,7 +6,7 @@ import datetime as dt
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -22,6 +22,7 @@ CRS_IS_WKT = 1 << 4
 _HEADER = struct.Struct("<4sHH16sBB32s32sHHHIIBHI5I3d3d6dQQIQ15Q")
 _VLR = struct.Struct("<H16sHH32s")
 _EVLR = struct.Struct("<H16sHQ32s")
+_EVLR_PLACE, _EVLR_AT = struct.Struct("<QI"), 235  # where extended records begin, and their number
 _EXTRA_BYTES = struct.Struct("<2xBB32s4x24x24x24xd16x24x32s")
 _UINT8, _UINT16, _FLOAT, _SCALED = 1, 3, 9, 1 << 3
 _COPC_INFO = struct.Struct("<5dQQ2d88x")
@@ -179,6 +180,28 @@ def encode_vlr(user_id: str, record_id: int, data: bytes, description: str) -> b
 def encode_evlr(user_id: str, record_id: int, data: bytes, description: str) -> bytes:
     """Return an extended variable length record, which follows the points."""
     return _EVLR.pack(0, user_id.encode(), record_id, len(data), description.encode()) + data
+
+
+def append_evlr(stream: BinaryIO, record: bytes) -> None:
+    """Append an extended record, as of `encode_evlr`, to a finished file, behind those that it has.
+
+    Raises:
+        ValueError: the file's last extended record does not end it; another program would lose what comes behind.
+    """
+    stream.seek(_EVLR_AT)
+    start, count = _EVLR_PLACE.unpack(stream.read(_EVLR_PLACE.size))
+    end = stream.seek(0, 2)
+    at = start
+    for _ in range(count):
+        stream.seek(at)
+        at += _EVLR.size + _EVLR.unpack(stream.read(_EVLR.size))[3]
+    if count and at != end:
+        raise ValueError(f"the file's {count} extended records end at byte {at}, the file at {end}")
+    stream.seek(0, 2)
+    stream.write(record)
+    stream.seek(_EVLR_AT)
+    stream.write(_EVLR_PLACE.pack(start if count else end, count + 1))
+    stream.seek(0, 2)
 
 
 def encode_copc_info(

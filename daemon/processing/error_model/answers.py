@@ -11,7 +11,7 @@ import numpy as np
 
 from swath.daemon.errors import ExitCode, UserError
 from swath.daemon.processing.error_model.file import ModelFile
-from swath.daemon.processing.error_model.points import Found, model_beside, nearest, of_files, rows_of
+from swath.daemon.processing.error_model.points import Found, model_of, nearest, of_files, rows_of
 from swath.georef.arrays import FloatArray
 from swath.georef.error_model.accuracy import ce90, ellipse, le90
 
@@ -144,7 +144,7 @@ def _near(paths: Sequence[Path], place: tuple[float, float]) -> list[tuple[Model
     found: list[tuple[float, ModelFile, Found, int]] = []
     closest = np.inf
     for path in paths:
-        file = model_beside(path)
+        file = model_of(path)
         points = nearest(path, file, place)
         apart = np.hypot(*((points.xyz[:, :2] - place) * file.unit_m[:2]).T)
         closest = min([closest, *apart.tolist()])

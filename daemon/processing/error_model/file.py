@@ -16,6 +16,7 @@ from swath.georef.error_model.model import ErrorModel, ErrorModelError
 from swath.georef.error_model.state import model_of_state, state_of
 
 ENDING = ".error_model.json"
+RECORD = "swath", 2  # user and number of the record in files of points
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +37,8 @@ class ModelFile:
     software: str
     session: str
 
-    def write(self, path: Path) -> None:
-        """Write the file; OSError where that fails."""
+    def text(self) -> str:
+        """Return the content of the file, and of the record in files of points."""
         content: dict[str, Any] = {
             "software": self.software,
             "session": self.session,
@@ -46,7 +47,7 @@ class ModelFile:
             "scanners": self.channels,
             **state_of(self.model),
         }
-        path.write_text(json.dumps(content, ensure_ascii=False) + "\n", encoding="utf-8")
+        return json.dumps(content, ensure_ascii=False) + "\n"
 
 
 def read_model(path: Path) -> ModelFile:
@@ -56,14 +57,23 @@ def read_model(path: Path) -> ModelFile:
         UserError: it cannot be read, or is no error model; one line.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"{path}: {error.strerror}; swath georef --error-model writes it beside the points") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: is no error model; write it again with swath georef --error-model") from error
+    return model_of_text(text, path)
+
+
+def model_of_text(text: str, path: Path) -> ModelFile:
+    """Return the model of a file's content; ``path`` is for errors, which are those of `read_model`."""
+    try:
+        content = json.loads(text)
         if not isinstance(content, Mapping):
             raise ErrorModelError("is no error model of swath georef")
         model = model_of_state(content)
         channels = {str(name): int(number) for name, number in content["scanners"].items()}
         unit_m = np.array(content["unit_m"], np.float64).reshape(3)
-    except OSError as error:
-        raise UserError(f"{path}: {error.strerror}; swath georef --error-model writes it beside the points") from error
     except ErrorModelError as error:
         raise UserError(f"{path}: {error}") from error
     except (ValueError, KeyError, AttributeError, TypeError) as error:

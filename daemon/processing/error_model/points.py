@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from swath.daemon.errors import UserError
-from swath.daemon.processing.error_model.file import ENDING, ModelFile, read_model
+from swath.daemon.processing.error_model.file import ENDING, RECORD, ModelFile, model_of_text, read_model
 from swath.daemon.processing.quicklook.point_files import UNREADABLE, PointReader, Points, Selection, open_points
 from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.error_model.model import ErrorModelError
@@ -41,19 +41,26 @@ class Found:
     row: Int64Array
 
 
-def model_beside(path: Path) -> ModelFile:
-    """Read the error model of a file of points: of its run, in the same folder.
+def model_of(path: Path) -> ModelFile:
+    """Read the error model of a file of points: the one in it, else the one of its run in the same folder.
 
     Raises:
         UserError: there is none, or several and none has the file's name; one line.
     """
     if not path.is_file():
         raise UserError(f"{path}: no such file")
+    try:
+        with open_points(path) as reader:
+            for record in reader.evlrs or ():
+                if (record.user_id, record.record_id) == RECORD:
+                    return model_of_text(record.record_data_bytes().decode("utf-8", "replace"), path)
+    except UNREADABLE as error:
+        raise UserError(f"{path}: cannot be read as a LAS or LAZ file ({error})") from error
     models = sorted(path.parent.glob(f"*{ENDING}"))
     own = [one for one in models if path.name.startswith(one.name.removesuffix(ENDING))]
     if len(own) != 1 and len(models) != 1:
         raise UserError(
-            f"{path}: has no error model beside it (NAME{ENDING}); swath georef --error-model writes it with the points"
+            f"{path}: has no error model in it, nor NAME{ENDING} beside it; swath georef --error-model writes both"
         )
     return read_model(own[0] if len(own) == 1 else models[0])
 
@@ -177,9 +184,9 @@ def of_files(paths: Sequence[Path]) -> ModelFile:
     Raises:
         UserError: files have different models; one line.
     """
-    first = model_beside(paths[0])
+    first = model_of(paths[0])
     for path in paths[1:]:
-        if path.parent.resolve() != paths[0].parent.resolve() and model_beside(path).session != first.session:
+        if path.parent.resolve() != paths[0].parent.resolve() and model_of(path).session != first.session:
             raise UserError(
                 f"{path}: has another error model than {paths[0]}; errors of different runs have no common model"
             )

@@ -26,7 +26,7 @@ from swath.daemon.log.durable import sync_file, try_sync_directory
 from swath.daemon.log.reader import Session
 from swath.daemon.processing.earlier_runs import listed_files, refuse_existing, stale_pages
 from swath.daemon.processing.error_model.build import build_model
-from swath.daemon.processing.error_model.file import ENDING, ModelFile
+from swath.daemon.processing.error_model.file import ENDING, RECORD, ModelFile
 from swath.daemon.processing.files import put_in_place, sha256_of
 from swath.daemon.processing.flights.read import (
     INTENSITY_FACTOR,
@@ -49,6 +49,7 @@ from swath.daemon.system import held_interrupts
 from swath.daemon.written import Reached, make_folder, note_written, room_noted
 from swath.drivers.driver import find_driver
 from swath.georef.formats.las import LasSettings
+from swath.georef.formats.las_header import append_evlr, encode_evlr
 from swath.georef.mapping.frame import MappingError
 from swath.georef.progress import BYTES, Tell
 from swath.georef.strips import Segment, StripError, segments
@@ -289,15 +290,16 @@ def _make(
     done = [path for made in files.values() for path in made if path is not None]
     tell("trajectory and sidecar", 0, 0)
     trajectories = [path for flight in flights for path in _write_trajectory(flight, partial)]
-    record = run_record(flights, results, files)
-    record["verdict"] = verdict_of(request, flights)
-    models = []
+    models: list[Path] = []
+    entry: dict[str, Any] = {}
     if request.error_model:
         tell("error model", 0, 0)
         models.append(partial / f"{name}{ENDING}")
-        record["error_model"] = _write_model(models[0], flights, jobs, results, numbers)
+        entry["error_model"] = _write_model(models[0], flights, jobs, results, numbers)
+    record = run_record(flights, results, files)
+    record["verdict"] = verdict_of(request, flights)
     others = [path.name for path in (*trajectories, *models)]
-    record |= {"logs": logs, "files": others, "options": request.record()}
+    record |= {"logs": logs, "files": others, "options": request.record()} | entry
     if stale := _stale(request.output, [flight.session.session_id for flight in flights]):
         record["warnings"].append(
             f"{request.output}: removed pages and pictures of the replaced points or trajectory: "
@@ -329,13 +331,20 @@ def _note_troubles(flights: Sequence[Flight], results: Sequence[JobResult]) -> N
 def _write_model(
     path: Path, flights: Sequence[Flight], jobs: Sequence[Job], results: Sequence[JobResult], numbers: dict[str, int]
 ) -> dict[str, Any]:
-    """Write the error model, and return its entry of the sidecar."""
+    """Write the error model to a file and into each file of points; return its entry of the sidecar."""
     mapping = flights[0].setup.mapping
     assert mapping is not None
     built = build_model(flights, jobs, results)
     session = flights[0].session.session_id
     file = ModelFile(built.model, numbers, mapping.unit_m, mapping.wkt, f"swath {__version__}", session)
-    file.write(path)
+    path.write_text(file.text(), encoding="utf-8")
+    record = encode_evlr(*RECORD, file.text().encode(), "error model, JSON")
+    for job, result in zip(jobs, results, strict=True):
+        points, _ = _files(job, result)
+        if points is not None:
+            with points.open("r+b") as stream:
+                append_evlr(stream, record)
+                result.file_bytes = stream.tell()
     return {"file": path.name, **built.summary()}
 
 

@@ -240,10 +240,41 @@ def test_pairs_of_a_table_are_answered_row_by_row(run: Run, tmp_path: Path, caps
     table.unlink()
 
 
+def without_model(path: Path, copy: Path) -> Path:
+    """Copy a file of points without its extended records."""
+    las = laspy.read(path)
+    las.evlrs = None
+    las.write(copy)
+    return copy
+
+
+def test_the_model_travels_with_the_points(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A file answers alone as beside its model, and so does its copy by another program."""
+    east, north, _ = points_of(run, 400)[0][200]
+    asked = ["--at", f"{east},{north}"]
+    there = told_by(["accuracy", str(run.strips[0]), *asked], capsys)
+    alone, again = tmp_path / "alone.laz", tmp_path / "again.laz"
+    alone.write_bytes(run.strips[0].read_bytes())
+    laspy.read(alone).write(again)
+    for copy in (alone, again):
+        assert told_by(["accuracy", str(copy), *asked], capsys) == [one | {"file": copy.name} for one in there]
+    with laspy.open(alone) as reader:
+        (record,) = reader.evlrs
+    assert (record.user_id, record.record_id) == ("swath", 2)
+    assert record.record_data_bytes().decode() == run.model.read_text()
+    (strip,) = [one for one in run.sidecar()["strips"] if one["file"] == run.strips[0].name]
+    assert strip["bytes"] == run.strips[0].stat().st_size
+    assert run_app(georef(run.flown, tmp_path / "copc", "--error-model", "--copc")) == ExitCode.OK
+    (first, *_) = sorted((tmp_path / "copc").glob("*.copc.laz"))
+    (other,) = told_by(["accuracy", str(first), *asked], capsys)
+    np.testing.assert_allclose(other["covariance_m2"], there[0]["covariance_m2"], rtol=1e-6)
+    with laspy.open(first) as reader:
+        assert [(one.user_id, one.record_id) for one in reader.evlrs] == [("copc", 1000), ("swath", 2)]
+
+
 def test_wrong_questions_get_one_line(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names, table = list(map(str, run.strips)), tmp_path / "pairs.csv"
-    lone = tmp_path / "lone.laz"
-    lone.write_bytes(run.strips[0].read_bytes())
+    lone = without_model(run.strips[0], tmp_path / "lone.laz")
     table.write_text(f"file_1,point_1,file_2,point_2\n{names[0]},1,{names[1]},99999999\n")
     headless = tmp_path / "headless.csv"
     headless.write_text("a,b\n1,2\n")
@@ -256,7 +287,7 @@ def test_wrong_questions_get_one_line(run: Run, tmp_path: Path, capsys: pytest.C
         (["--at", "1,2"], "needs LAZ"),
         (["--pairs", str(table)], "needs -o CSV"),
         ([str(tmp_path / "none.laz"), "--at", "1,2"], "no such file"),
-        ([str(lone), "--at", "1,2"], "has no error model beside it"),
+        ([str(lone), "--at", "1,2"], "has no error model in it, nor NAME.error_model.json beside it"),
         (["--pairs", str(table), *answers], "has no row 99999999; its"),
         (["--pairs", str(headless), *answers], "has no column file_1"),
         (["--pairs", str(tmp_path / "none.csv"), *answers], "No such file"),
@@ -269,8 +300,7 @@ def test_wrong_questions_get_one_line(run: Run, tmp_path: Path, capsys: pytest.C
 
 
 def test_a_model_of_another_run_is_refused(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    points = tmp_path / run.strips[0].name
-    points.write_bytes(run.strips[0].read_bytes())
+    points = without_model(run.strips[0], tmp_path / run.strips[0].name)
     model = tmp_path / run.model.name
     state = json.loads(run.model.read_text())
     first = state["units"][0]
