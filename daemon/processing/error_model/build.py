@@ -136,7 +136,8 @@ def _unit(flight: Flight, strip: int, name: str, sampled: Sampled, posts: _Posts
 
 def _noise(flight: Flight, name: str) -> Noise:
     table = flight.setup.config.scanner[name]
-    return Noise(table.range_sigma_m, float(np.radians(table.angle_sigma_deg)))
+    wide = 0.0 if flight.setup.options.surface == "none" else 1e-3 * table.divergence_mrad
+    return Noise(table.range_sigma_m, float(np.radians(table.angle_sigma_deg)), divergence_rad=wide)
 
 
 def _post_times(first_ns: int, last_ns: int) -> Int64Array:

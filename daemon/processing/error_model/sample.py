@@ -14,10 +14,11 @@ from swath.georef.arrays import ByteArray, FloatArray, Int64Array, StructArray
 from swath.georef.error_model.build import Sample
 from swath.georef.georeference import Georeferencer
 from swath.georef.mapping.frame import Mapping as MappingFrame
-from swath.georef.points import Fate, Points
+from swath.georef.points import Fate, Points, Rays
 from swath.georef.scanner.calibration import Calibration
 from swath.georef.scanner.jacobian import ELEVATION, OBSERVATIONS, observation_columns_e, parameter_columns_e
 from swath.georef.scanner.uncertainty import Noise
+from swath.georef.surface.planes import STEEPEST_RAD
 from swath.georef.trajectory.trajectory import Trajectory
 
 MOMENTS = 12  # of a strip
@@ -84,6 +85,7 @@ class _Sampler(Georeferencer):
             noise = [by_reading[:, _RANGE] * sigma.range_m, by_reading[:, _ANGLE] * sigma.angle_rad]
             if self.model.aimed:
                 noise.append(by_reading[:, ELEVATION] * sigma.angle_rad)
+            noise.append(_footprint(rays, sigma.divergence_rad))
             self._kept.append(
                 Sampled(
                     rays.time_ns,
@@ -94,6 +96,14 @@ class _Sampler(Georeferencer):
                 )
             )
         return Points.empty(0, with_sigmas=False), np.full(len(rows), Fate.GEOREFERENCED, np.uint8)
+
+
+def _footprint(rays: Rays, divergence_rad: float) -> FloatArray:
+    """Return one sigma (n, 3) in e of the footprint's error on level ground, along the beam (FORMULAS 5)."""
+    slope = np.tan(np.minimum(np.abs(rays.off_nadir_rad), STEEPEST_RAD))
+    beam = rays.points_e - rays.origin_e
+    footprint: FloatArray = beam * (divergence_rad * slope / 4.0)[:, np.newaxis]
+    return footprint
 
 
 def independent_errors(calibration: Calibration) -> FloatArray:
