@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -272,8 +272,10 @@ def _key_at(level: int, x: float, y: float, z: float) -> int:
 
 @jit_inline
 def _slot_of(key: int, size: int) -> int:
-    mixed = (key ^ (key >> 21)) * 0x9E3779B1
-    return (mixed ^ (mixed >> 17)) & (size - 1)
+    unsigned = np.uint64(key)  # a signed product must not overflow
+    mixed = (unsigned ^ (unsigned >> np.uint64(21))) * np.uint64(0x9E3779B1)
+    slot: Any = np.int64((mixed ^ (mixed >> np.uint64(17))) & np.uint64(size - 1))
+    return int(slot)
 
 
 @jit_cached
