@@ -9,7 +9,7 @@ RATE ?= 0.1
 SEEDS ?= 5
 # how workers share the tests: tests/conftest.py says which belong together, and which begin
 SHARED := --dist loadgroup --no-loadscope-reorder
-# WITHOUT: a further condition of test-slow. RESULTS: a folder for a JUnit file of each run, which .ci/run sums up
+# WITHOUT: a mark whose tests test-slow leaves out. RESULTS: a folder for a JUnit file of each run, which .ci/run sums up
 PYTEST = $(BIN)/python -m pytest -p no:cacheprovider $(if $(RESULTS),--junitxml=$(RESULTS)/$@$(1).xml)
 
 DESTDIR ?=
@@ -35,7 +35,7 @@ test: $(VENV)/.tests $(VENV)/.tools ## install what they need, then run style, t
 	$(call PYTEST,-alone) -n 0 -m "alone and not slow and not long"
 
 test-slow: $(VENV)/.tests $(VENV)/.tools ready ## run the longer tests: whole flights and calibrations, the demo, the installation
-	$(PYTEST) -n $(JOBS) $(SHARED) -m "slow and not long and not alone and not peers$(WITHOUT)"
+	$(PYTEST) -n $(JOBS) $(SHARED) -m "slow and not long and not alone and not peers$(if $(WITHOUT), and not $(WITHOUT))"
 	$(call PYTEST,-alone) -n 0 -m "alone and slow and not long"
 
 test-computing: $(VENV)/.tests ready ## run those of test-slow that only compute, and so may run beside anything
