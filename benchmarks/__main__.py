@@ -9,6 +9,7 @@ from benchmarks import (
     adjustment,
     clock,
     decode,
+    error_model,
     georef,
     georef_log,
     listen,
@@ -29,6 +30,7 @@ navigation_honesty.main()
 navigation_seeds.main()
 adjustment.main()
 planes.main()
+error_model.main()
 clock.main()
 acquire.main()
 listen.main()

@@ -1,7 +1,8 @@
 """Airborne laser scanning, from the sensors' wires to the point cloud.
 
 ``swath.open`` reads logs; ``swath.navigate``, ``swath.georeference`` and ``swath.calibrate`` process them;
-``swath.aio`` opens devices in asyncio and follows a recorder. Below these, ``swath.georef`` georeferences,
+``swath.error_model`` tells how sure differences of points are; ``swath.aio`` opens devices in asyncio and follows a
+recorder. Below these, ``swath.georef`` georeferences,
 ``swath.calib`` calibrates, ``swath.drivers`` reads devices, ``swath.daemon`` records and holds the command line,
 ``swath.sim`` flies a virtual aircraft.
 """
@@ -21,7 +22,7 @@ _NAMES = {
     "swath.processing": ("CalibrationResult", "PointCloud", "Track", "calibrate", "georeference", "navigate"),
 }
 _PLACES = {name: module for module, names in _NAMES.items() for name in names}
-_MODULES = ("aio",)
+_MODULES = ("aio", "error_model")
 __all__ = ["__version__", *sorted([*_PLACES, *_MODULES])]
 
 

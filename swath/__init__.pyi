@@ -1,4 +1,5 @@
 from swath import aio as aio
+from swath import error_model as error_model
 from swath.daemon.errors import SwathError as SwathError
 from swath.logs import Capture as Capture
 from swath.logs import Log as Log

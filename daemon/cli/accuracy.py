@@ -25,6 +25,11 @@ def command(
         tuple[str, str] | None,
         typer.Option(metavar="E,N E,N", help="Two places: the difference of their nearest points."),
     ] = None,
+    volume: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="A polygon, GeoJSON or lines of easting,northing: its volume over --base."),
+    ] = None,
+    base: Annotated[float | None, typer.Option(metavar="H", help="Height of the base of --volume.")] = None,
     pairs: Annotated[
         Path | None,
         typer.Option(metavar="CSV", help="Pairs of points: columns file_1, point_1, file_2, point_2; rows from 0."),
@@ -44,9 +49,15 @@ def command(
     from swath.daemon.processing.earlier_runs import refuse_existing
     from swath.daemon.processing.error_model import answers
 
-    asked = [name for name, value in (("--at", at), ("--between", between), ("--pairs", pairs)) if value is not None]
+    asked = [
+        name
+        for name, value in (("--at", at), ("--between", between), ("--pairs", pairs), ("--volume", volume))
+        if value is not None
+    ]
     if len(asked) != 1:
-        raise UserError("give one of --at E,N, --between E,N E,N and --pairs CSV", ExitCode.USAGE)
+        raise UserError("give one of --at E,N, --between E,N E,N, --volume FILE and --pairs CSV", ExitCode.USAGE)
+    if (base is None) != (volume is None):
+        raise UserError("--volume FILE and --base H go together", ExitCode.USAGE)
     if pairs is not None:
         if output is None or points:
             raise UserError(
@@ -58,7 +69,12 @@ def command(
         return
     if not points or output is not None:
         raise UserError(f"{asked[0]} needs LAZ… of swath georef --error-model, and no -o", ExitCode.USAGE)
-    if at is not None:
+    if volume is not None and base is not None:
+        from swath.daemon.processing.error_model import volume as volumes
+
+        measured = volumes.volume(points, volumes.read_polygon(volume), base)
+        print(json.dumps(measured, indent=2) if as_json else "\n".join(map(one_line, volumes.volume_lines(measured))))
+    elif at is not None:
         told = answers.at_place(points, _place(at, "--at"))
         lines = answers.point_lines(told)
         print(json.dumps(told, indent=2) if as_json else "\n".join(map(one_line, lines)))

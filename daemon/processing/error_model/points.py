@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.path import Path as Outline
 
 from swath.daemon.errors import UserError
 from swath.daemon.processing.error_model.file import ENDING, RECORD, ModelFile, model_of_text, read_model
@@ -119,6 +121,31 @@ def rows_of(path: Path, file: ModelFile, rows: Int64Array) -> Found:
     if len(wanted) and wanted[-1] >= at:
         raise UserError(f"{path}: has no row {wanted[-1]}; its {at:,} points have the rows 0 to {at - 1:,}")
     xyz, seconds, strips, channels = (np.concatenate(column)[back] for column in zip(*pieces, strict=True))
+    return _found(path, file, xyz, seconds, strips, channels, rows)
+
+
+def within(path: Path, file: ModelFile, corners: FloatArray) -> Found:
+    """Return the points of a file in a polygon, corners (n, 2) in its CRS.
+
+    Raises:
+        UserError: the file cannot be read, or the model does not describe it; one line.
+    """
+    kept: list[list[Any]] = []
+    at = 0
+    outline, middle = Outline(corners - corners.mean(axis=0)), corners.mean(axis=0)
+    with _opened(path) as reader:
+        while len(points := _read(path, reader)):
+            places = np.stack([np.asarray(points.x), np.asarray(points.y)], axis=1)
+            inside = outline.contains_points(places - middle)
+            rows = np.flatnonzero(inside)
+            some = points[rows]
+            xyz = np.stack([np.asarray(some.x), np.asarray(some.y), np.asarray(some.z)], axis=1)
+            integers = [np.asarray(one).astype(np.int64) for one in (some.point_source_id, some.scanner_channel)]
+            kept.append([xyz, np.asarray(some.gps_time), *integers, rows + at])
+            at += len(points)
+    if not kept:
+        kept.append([np.zeros((0, 3)), np.zeros(0), *(np.zeros(0, np.int64) for _ in range(3))])
+    xyz, seconds, strips, channels, rows = (np.concatenate(column) for column in zip(*kept, strict=True))
     return _found(path, file, xyz, seconds, strips, channels, rows)
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from pyproj import Transformer
 
+import swath
 from swath.daemon.cli.main import run_app
 from swath.daemon.errors import ExitCode
 from swath.daemon.processing.error_model.file import ENDING, read_model
@@ -272,6 +273,29 @@ def test_the_model_travels_with_the_points(run: Run, tmp_path: Path, capsys: pyt
         assert [(one.user_id, one.record_id) for one in reader.evlrs] == [("copc", 1000), ("swath", 2)]
 
 
+def test_python_answers_as_the_command_does(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    places, times, strips, _ = points_of(run, 400)
+    first, second = np.flatnonzero(strips == 1)[200], np.flatnonzero(strips == 2)[200]
+    model = swath.error_model.read(run.strips[0])
+    assert model.strips == [1, 2]
+    assert model.scanners == {"left": 0}
+    assert model.state() == swath.error_model.read(run.model).state() == json.loads(run.model.read_text())
+    (told, *_) = told_by(["accuracy", str(run.strips[0]), "--at", f"{places[first][0]},{places[first][1]}"], capsys)
+    found = model.covariance(places[first], times[[first]], 1)
+    np.testing.assert_allclose(found[0], told["covariance_m2"], rtol=1e-6, atol=1e-9)  # times to 256 ns
+    assert swath.error_model.figures(found[0])["ce90_m"] == pytest.approx(told["ce90_m"], rel=1e-6)
+    sides = (places[first], times[[first]], strips[[first]], places[second], times[[second]], strips[[second]])
+    crossed, apart = model.cross_covariance(*sides), model.difference(*sides)
+    alone = found + model.covariance(places[second], times[[second]], 2)
+    np.testing.assert_allclose(apart, alone - crossed - crossed.transpose(0, 2, 1), atol=1e-12)
+    with pytest.raises(swath.error_model.ErrorModelError, match="has no strip 9; it has 1, 2"):
+        model.covariance(places[first], times[[first]], 9)
+    with pytest.raises(ValueError, match="1 points have 2 times"):
+        model.covariance(places[first], times[:2], 1)
+    with pytest.raises(swath.SwathError, match="no such file"):
+        swath.error_model.read(run.folder / "none.laz")
+
+
 def test_wrong_questions_get_one_line(run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     names, table = list(map(str, run.strips)), tmp_path / "pairs.csv"
     lone = without_model(run.strips[0], tmp_path / "lone.laz")
@@ -280,7 +304,7 @@ def test_wrong_questions_get_one_line(run: Run, tmp_path: Path, capsys: pytest.C
     headless.write_text("a,b\n1,2\n")
     answers = ["-o", str(tmp_path / "answers.csv")]
     for arguments, told in (
-        ([], "give one of --at E,N, --between E,N E,N and --pairs CSV"),
+        ([], "give one of --at E,N, --between E,N E,N, --volume FILE and --pairs CSV"),
         ([*names, "--at", "1,2", "--pairs", str(table)], "give one of"),
         ([*names, "--at", "1"], "want easting and northing"),
         ([*names, "--at", "1,2"], "no point lies within 2 m of 1.000, 2.000; the nearest is"),
