@@ -35,10 +35,8 @@ COMPUTING = (
     "calib",
     "georef",
     *("library/test_calibrate.py", "library/test_notebook.py", "library/test_processing.py"),
-    *(
-        f"daemon/processing/{name}"
-        for name in ("calibration", "error_model", "flightplan", "points", "strips", "trajectory")
-    ),
+    *(f"daemon/processing/{name}" for name in ("calibration", "error_model", "flightplan", "history", "points")),
+    *(f"daemon/processing/{name}" for name in ("quicklook", "strips", "trajectory")),
 )
 
 

@@ -192,6 +192,7 @@ def tied(built: Made, noise_m: float, seed: int) -> tuple[TiePoint, ...]:
     return tuple(ties)
 
 
+@pytest.mark.slow
 def test_tie_points_alone_determine_the_truth() -> None:
     built = made(noise=0.0)
     prior = gauss_markov(built.flight, Taus(), 4.0)

@@ -98,6 +98,7 @@ def same(read: Calibration, written: Calibration, *, exactly: bool) -> None:
         check([got.azimuth_rad, got.elevation_rad, got.range_m], [beam.azimuth_rad, beam.elevation_rad, beam.range_m])
 
 
+@pytest.mark.slow
 @settings(max_examples=120, deadline=None)
 @given(calibrations(), TEXT, TEXT)
 def test_a_written_calibration_is_read_back(calibration: Calibration, identity: str, serial: str) -> None:

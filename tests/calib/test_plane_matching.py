@@ -75,6 +75,7 @@ def shifted(flight: Flight, swath: int, by_m: float) -> Flight:
     return replace(flight, swaths=tuple(swaths))
 
 
+@pytest.mark.slow
 def test_unmoved_points_keep_their_planes(flight: Flight, settled: Features) -> None:
     """All but a patch or two are unchanged at once; after that they are equal bit for bit."""
     again = rematch(flight, settled)
@@ -94,6 +95,7 @@ def test_matched_planes_equal_the_planes_found(flight: Flight, settled: Features
         assert one.normal_t @ other.normal_t > np.cos(np.radians(0.5))
 
 
+@pytest.mark.slow
 def test_displaced_planes_are_found_again_after_alignment(cast: Cast, flight: Flight) -> None:
     """The planes were found with 0.03° of error in all angles; after the first adjustment points move by 0.4 m."""
     wrong = moved(cast, omega_rad=5e-4, phi_rad=-5e-4, kappa_rad=1e-3)

@@ -101,6 +101,7 @@ def built_roofs(cast: Cast, features: Features) -> list[tuple[Plane, int, float]
 # --- what is found --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_roof_is_one_face_of_the_scene_and_has_its_direction(cast: Cast, found: Features) -> None:
     roofs = built_roofs(cast, found)
     assert len(roofs) > 20

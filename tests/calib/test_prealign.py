@@ -64,6 +64,7 @@ def errors_deg(cast: Cast, found: dict[str, Calibration]) -> list[float]:
     return [float(np.degrees(found["left"].value(name) - cast.truth.value(name))) for name in NAMES[:3]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("degrees", "range_m"),
     [((-3.0, 3.0, -3.0), 5.0), ((3.0, -3.0, -3.0), -5.0)],
@@ -76,6 +77,7 @@ def test_errors_of_three_degrees_and_five_metres_become_small(
     assert abs(found["left"].value("range_offset_m") - cast.truth.value("range_offset_m")) < 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [2])
 def test_errors_become_small_over_flat_ground_with_houses_only(seed: int) -> None:
     flat = cast_flight(TERRAIN.format(relief=0.0), LINES, prf_hz=9_000.0, seed=seed)
@@ -131,6 +133,7 @@ def test_a_long_line_is_aligned_by_the_part_that_a_short_one_crosses() -> None:
     assert np.hypot(roll, pitch) < 0.2
 
 
+@pytest.mark.slow
 def test_planes_are_found_after_prealignment() -> None:
     """With 1° of error the swaths have no common planes; after alignment they have the roofs of the scene."""
     dense = cast_flight(TERRAIN.format(relief=8.0), LINES, prf_hz=16_000.0)
@@ -143,6 +146,7 @@ def test_planes_are_found_after_prealignment() -> None:
     assert sum(plane.kind == "roof" and len(plane.patches) == 3 for plane in before.planes) < 3
 
 
+@pytest.mark.slow
 def test_two_heads_are_aligned_together(cast: Cast) -> None:
     """The second one flew the third line, with another mounting."""
     flight = cast.flight
@@ -155,6 +159,7 @@ def test_two_heads_are_aligned_together(cast: Cast) -> None:
     assert np.abs(errors_deg(cast, {"left": found["right"]})).max() < 0.1
 
 
+@pytest.mark.slow
 def test_control_determines_the_height(cast: Cast) -> None:
     """The range is off by 5 m; one line flown twice shows no height, but points of the true ground do."""
     flight = replace(cast.flight, swaths=cast.flight.swaths[:2])

@@ -78,6 +78,7 @@ def test_a_sound_flight_gets_no_corrections(clean: tuple[Flight, Features]) -> N
     np.testing.assert_array_equal(result.trajectories[0].position_e, flight.trajectories[0].position_e)
 
 
+@pytest.mark.slow
 def test_a_shift_and_a_drift_are_found_in_their_strips(clean: tuple[Flight, Features]) -> None:
     """One strip is 15 cm too high and 10 cm aside, another's roll drifts; both are corrected and no other moves."""
     flight, features = clean
@@ -112,6 +113,7 @@ def test_a_shift_and_a_drift_are_found_in_their_strips(clean: tuple[Flight, Feat
     assert 0.0 < gains["linear"] < gains["spline"]
 
 
+@pytest.mark.slow
 def test_a_bend_needs_a_spline_with_knots(clean: tuple[Flight, Features]) -> None:
     """A strip's height rises by 12 cm in its middle."""
     flight, features = clean
@@ -130,6 +132,7 @@ def test_a_bend_needs_a_spline_with_knots(clean: tuple[Flight, Features]) -> Non
     assert adjusted(bad, features, knot_s=3.0, criterion="aicc").choices[1].model == "spline"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lifts", [{1: 0.15}, {6: 0.15}, {1: 0.15, 3: 0.1}, {1: -0.1, 2: 0.1}])
 def test_only_the_displaced_strips_are_corrected(clean: tuple[Flight, Features], lifts: dict[int, float]) -> None:
     """The other strips agree, so none of them may be moved to the wrong one, whichever it is."""
@@ -146,6 +149,7 @@ def test_only_the_displaced_strips_are_corrected(clean: tuple[Flight, Features],
         assert (off < 3.5 * result.fit.position_sigma_l[mine, 2]).all()
 
 
+@pytest.mark.slow
 def test_a_common_shift_is_found_only_with_control(clean: tuple[Flight, Features]) -> None:
     """All strips are 12 cm too high; nothing is found without control, and it is right within a centimetre with it."""
     flight, features = clean
@@ -165,6 +169,7 @@ def test_a_common_shift_is_found_only_with_control(clean: tuple[Flight, Features
     assert max(down) < 0.03 < off_planes(low, features, 1)
 
 
+@pytest.mark.slow
 def test_poorly_determined_corrections_are_not_applied(
     clean: tuple[Flight, Features], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -206,6 +211,7 @@ def turned(components: FloatArray, course_deg: float) -> FloatArray:
     return np.concatenate([rotation @ components[:3], rotation @ components[3:]])
 
 
+@pytest.mark.slow
 def test_a_strip_beside_the_others_is_not_corrected_and_moves_none(clean: tuple[Flight, Features]) -> None:
     """Strip 6 shares no plane with others; strip 7 overlaps them only at its edge, where it is 30 cm too high.
 

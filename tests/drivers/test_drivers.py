@@ -132,6 +132,7 @@ def make_and_feed(parser: Parser, units: list[bytes]) -> None:
     assert parser.counters.bytes == 3 * sum(map(len, units))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("driver", [driver for driver in DRIVERS if not refusal(driver)], ids=of_protocol)
 @settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(units=st.lists(st.one_of(st.binary(max_size=300), st.binary(min_size=16, max_size=16)), max_size=8))

@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import swath.georef
 
 INNER = """from swath.georef.compiled import jit_inline
@@ -18,6 +20,8 @@ def inner(x: float) -> float:
     return {factor} * x
 """
 OUTER = """from swath.georef.compiled import jit_cached
+import pytest
+
 from swath.georef.inner import inner
 
 
@@ -30,6 +34,7 @@ print(outer(1.0), sum(outer.stats.cache_hits.values()))
 """
 
 
+@pytest.mark.slow
 def test_a_kernel_changed_in_another_file_is_compiled_anew(tmp_path: Path) -> None:
     package = tmp_path / "swath/georef"
     package.mkdir(parents=True)
@@ -54,6 +59,7 @@ def test_a_kernel_changed_in_another_file_is_compiled_anew(tmp_path: Path) -> No
     assert run(3.0) == "3.0 0"
 
 
+@pytest.mark.slow
 def test_a_kernel_is_compiled_without_a_writable_cache_folder(tmp_path: Path) -> None:
     package = tmp_path / "swath/georef"
     package.mkdir(parents=True)
@@ -73,6 +79,7 @@ def test_a_kernel_is_compiled_without_a_writable_cache_folder(tmp_path: Path) ->
     assert done.stdout.strip() == "4.0", done.stderr
 
 
+@pytest.mark.slow
 def test_a_loop_that_cannot_be_stored_runs_all_the_same(tmp_path: Path) -> None:
     """Several commands at once compile the same loops on a new installation; numba may then refuse to store one."""
     script = tmp_path / "kernel.py"

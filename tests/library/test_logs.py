@@ -136,6 +136,7 @@ def test_a_datetime_is_a_time(log: swath.Log) -> None:
         log["gnss/rover"].fixes(start=dt.datetime(2026, 6, 15))  # noqa: DTZ001
 
 
+@pytest.mark.slow
 def test_data_frames_have_flat_columns_with_units(log: swath.Log) -> None:
     samples = log["imu/main"].samples()
     frame = log.to_pandas("imu/main")

@@ -116,6 +116,7 @@ def test_the_chain_equals_least_squares_in_one_piece() -> None:
         np.testing.assert_allclose(shorter.covariance() / unit, flat[np.ix_(at, at)] / unit, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_errors_of_navigated_flights_are_correlated_as_the_chain_states() -> None:
     """80 flights differ in their noise: χ² is computed of 24 joint errors at four moments and of their differences.
 
@@ -292,6 +293,7 @@ def test_trajectories_of_two_sessions_are_independent() -> None:
     assert (np.diff(prior.time_ns[prior.trajectory_index == 1]) > 0).all()
 
 
+@pytest.mark.slow
 def test_knots_are_widened_and_reported_if_there_would_be_too_many() -> None:
     """The knots that are left are spread evenly over all strips; strips that meet keep separate knots."""
     flight = made([(0, 1, 10, 60), (0, 2, 60.4, 90), (0, 3, 120, 180)], [level_path(200)])
@@ -330,6 +332,7 @@ def test_impossible_trajectory_priors_are_refused() -> None:
 # ---------------------------------------------------------------------- drawn and applied
 
 
+@pytest.mark.slow
 def test_drawn_errors_have_the_covariance() -> None:
     """20 000 draws, with one component known exactly and two identical ones, agree within the sampling error."""
     flight = made([(0, 1, 10, 15)], [level_path(60)])

@@ -90,6 +90,7 @@ def test_corrections_of_the_lecture_are_described_in_words_and_by_mounting(
     assert (f"{rear_deg}° in the scanner's own axes" in rear) == bool(rear_deg)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("sign", "rear"), [(1.0, False), (-1.0, True)])
 @pytest.mark.parametrize(("parameter", "kind"), ONE_AT_A_TIME)
 def test_each_single_error_is_found(parameter: str, kind: str, sign: float, rear: bool) -> None:
@@ -104,6 +105,7 @@ def test_each_single_error_is_found(parameter: str, kind: str, sign: float, rear
         assert np.sign(profile.separation_m) == sign
 
 
+@pytest.mark.slow
 def test_a_flight_without_errors_gives_no_corrections() -> None:
     flight = village()
     found = measure(flight, CONTROL)
@@ -112,6 +114,7 @@ def test_a_flight_without_errors_gives_no_corrections() -> None:
         assert abs(profile.found) < 4.0 * profile.noise_sigma
 
 
+@pytest.mark.slow
 def test_the_procedure_finds_all_errors_and_is_reproducible() -> None:
     true = {"omega_rad": 0.012, "phi_rad": -0.01, "kappa_rad": 0.01, "range_offset_m": 0.35}
     result = stepwise(village(**true), CONTROL)
@@ -235,6 +238,7 @@ def test_unsuitable_lines_give_no_profile() -> None:
     assert not any(step.profiles for step in result.steps)
 
 
+@pytest.mark.slow
 def test_opposite_lines_side_by_side_do_not_separate_heading_from_pitch() -> None:
     opposite = (THERE, Line(145, 90, 270, 290, 300))
     result = stepwise(village(opposite, phi_rad=0.006), settings=Settings(rounds=1))
@@ -339,6 +343,7 @@ def test_the_report_shows_the_roll_left_by_the_adjustment() -> None:
     assert apart[1] == pytest.approx(2.0 * 0.004, rel=0.3)
 
 
+@pytest.mark.slow
 def test_a_pitch_found_for_one_scanner_does_not_apply_to_another() -> None:
     """Scanner left flew lines that determine pitch; right flew opposite lines side by side, which heading moves too."""
     one = village(phi_rad=0.006)

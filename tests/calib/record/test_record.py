@@ -339,6 +339,7 @@ def test_a_correction_by_intensity_is_recorded(outcome: Outcome, nodes: int, who
     assert flat["CA_Intensity.intensityCorrection.matrix.attachment"] == "left.npz"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", [row.key for row in ROWS])
 def test_facts_given_by_the_user_are_recorded_in_their_class(outcome: Outcome, key: str) -> None:
     """A user's fact replaces a computed or missing value of any attribute."""

@@ -78,6 +78,7 @@ def misses(flight: Flight, **true: float) -> tuple[FloatArray, FloatArray, Float
     return np.array(off), np.array(covariance), np.array(made)
 
 
+@pytest.mark.slow
 def test_shifts_match_a_wrong_boresight_and_their_sigmas() -> None:
     true = {"omega_rad": 0.0013, "phi_rad": -0.0017}
     off, covariance, made = misses(flown(**true), **true)
@@ -88,6 +89,7 @@ def test_shifts_match_a_wrong_boresight_and_their_sigmas() -> None:
     assert np.linalg.norm(off[:, :2], axis=1).max() < 0.1
 
 
+@pytest.mark.slow
 def test_heights_lie_on_the_plane_of_each_swath() -> None:
     """A wrong roll tilts the two swaths against each other, so each sighting lies on its own swath."""
     true = {"omega_rad": 0.0013, "phi_rad": -0.0017}

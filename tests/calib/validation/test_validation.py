@@ -94,6 +94,7 @@ def with_sigmas(calibration: Calibration, **sigmas: float) -> Calibration:
 # ---------------------------------------------------------------------- the methods
 
 
+@pytest.mark.slow
 def test_a_true_calibration_passes_every_applicable_method(
     made: Cast, roofs: Features, control: list[ControlPoint]
 ) -> None:

@@ -48,6 +48,7 @@ class TestHelp:
         ]
         assert codes == [*(int(code) for code in ExitCode), INTERRUPTED, PIPE_CLOSED]
 
+    @pytest.mark.slow
     def test_every_command_has_its_own_help(self) -> None:
         for listed in COMMANDS:
             result = CliRunner().invoke(make_app(None), [listed.name, "--help"])

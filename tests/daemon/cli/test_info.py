@@ -30,6 +30,7 @@ from tests.daemon.rig import Recorder, session_table
 ROVER = '[gnss.rover]\ntransport = "serial:{path}?baud=921600"\nprotocol = "novatel"\n'
 
 
+@pytest.mark.slow
 def test_numbers_of_a_recording_match_a_direct_parse(tmp_path: Path) -> None:
     import numpy as np
 
@@ -106,6 +107,7 @@ def test_the_same_log_given_twice_counts_once(tmp_path: Path) -> None:
     assert session["sources"]["scanner/left"]["units"] == 1200
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["info", "replay"])
 def test_a_missing_log_is_reported_in_one_line(tmp_path: Path, command: str) -> None:
     (tmp_path / "text.mcap").write_text("no log")

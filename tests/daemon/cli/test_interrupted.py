@@ -67,6 +67,7 @@ def without_compiling(said: str) -> str:
     return "".join(line for line in said.splitlines(keepends=True) if not line.startswith("compiling "))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", ["clocks", "points", "trajectory and sidecar"])
 def test_georef_leaves_nothing_in_any_phase(flown: Flown, place: Path, phase: str) -> None:
     arguments = flown.arguments(place / "new/out")
@@ -74,6 +75,7 @@ def test_georef_leaves_nothing_in_any_phase(flown: Flown, place: Path, phase: st
     assert list(place.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_georef_over_earlier_products_leaves_them_whole(flown: Flown, products: Path, place: Path) -> None:
     copy = Path(shutil.copytree(products, place / "out"))
     before = {path.name: path.read_bytes() for path in copy.iterdir()}
@@ -82,6 +84,7 @@ def test_georef_over_earlier_products_leaves_them_whole(flown: Flown, products: 
     assert {path.name: path.read_bytes() for path in copy.iterdir()} == before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "phase"),
     [
@@ -133,6 +136,7 @@ def test_recover_leaves_nothing_but_the_log(flown: Flown, place: Path, phase: st
     assert log.stat().st_size == flown.log.stat().st_size // 2
 
 
+@pytest.mark.slow
 def test_replay_says_what_it_has_played(flown: Flown, tmp_path: Path) -> None:
     port = free_udp_port()
     wire = tmp_path / "wire.toml"
@@ -236,6 +240,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         yield folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "phase"),
     [

@@ -217,6 +217,7 @@ class Said(Events):
         return Event(0, severity, source, code, text)
 
 
+@pytest.mark.slow
 async def test_the_service_waits_for_a_manual_recovery(logs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(repair, "_LOOK_AGAIN_S", 0.05)
     temporary = logs / CUT.replace(".mcap", ".recovered.mcap.part")

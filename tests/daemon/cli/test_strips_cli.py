@@ -113,6 +113,7 @@ def products(
     return folder
 
 
+@pytest.mark.slow
 def test_record_and_table_show_the_numbers_of_a_lifted_strip(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -151,6 +152,7 @@ def test_the_page_begins_with_the_verdict_and_shows_strips_pairs_and_the_map(tmp
     assert read.metadata.title == "now: comparison of strips"
 
 
+@pytest.mark.slow
 def test_the_console_has_verdict_strips_and_the_ten_worst_pairs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -333,6 +335,7 @@ def test_strips_of_two_scanners_processed_apart_are_the_same_strips(made: Cast, 
     assert (strips.look.names, strips.notes) == (["1", "2"], [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("of_week", [(2,), (1, 2)])
 def test_seconds_of_the_week_belong_to_the_trajectory_beside_them(
     made: Cast, tmp_path: Path, of_week: tuple[int, ...]
@@ -349,6 +352,7 @@ def test_seconds_of_the_week_belong_to_the_trajectory_beside_them(
     assert [note.startswith(mixed) for note in strips.notes] == [True] * (of_week == (2,))
 
 
+@pytest.mark.slow
 def test_points_of_another_time_than_their_trajectory_are_reported(made: Cast, tmp_path: Path) -> None:
     folder = products(tmp_path / "p", made.flight, of_week=(1, 2))
     week = made.flight.trajectories[0].span[0] // WEEK_NS

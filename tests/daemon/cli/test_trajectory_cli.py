@@ -78,6 +78,7 @@ class TestSmoothed:
         assert (spread < 3.0).all(), spread  # a single flight has few independent errors
         assert np.sqrt((normalised**2).mean()) > 0.2  # the sigmas are not too large either
 
+    @pytest.mark.slow
     def test_the_summary_describes_the_inputs(self, flown: Flown, made: Path) -> None:
         told = summary(made)
         assert (told["format"], told["solution"], told["point"]) == ("swath.trajectory", "smoothed", "body")

@@ -143,6 +143,7 @@ def log(made: Cast, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_an_unusable_trajectory_is_the_first_line_and_a_problem(
     log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -173,6 +174,7 @@ def test_a_true_calibration_passes(log: Path, tmp_path: Path, capsys: pytest.Cap
     assert passed["secondAltitude"] is None
 
 
+@pytest.mark.slow
 def test_a_wrong_calibration_fails(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = [str(file_of(tmp_path / "bad.toml", boresight(0.04))), str(log)]
     with pytest.raises(UserError, match=r"the calibration does not hold: (\d) of \1 methods failed$"):
@@ -238,6 +240,7 @@ def test_the_validation_is_added_to_the_record_beside_the_file(log: Path, tmp_pa
     assert (tmp_path / "left.record.json").read_bytes() == old
 
 
+@pytest.mark.slow
 def test_another_record_can_be_named_and_that_of_another_calibration_is_unchanged(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

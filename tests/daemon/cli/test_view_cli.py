@@ -94,6 +94,7 @@ def page(products: Path) -> Page:
     return Page((products / "view" / "index.html").read_text(encoding="utf-8"))
 
 
+@pytest.mark.slow
 def test_pictures_are_written_beside_the_page_and_embedded(products: Path, page: Page) -> None:
     assert len(page.sources) == len(PICTURES)
     for name, source in zip(PICTURES, page.sources, strict=True):
@@ -148,6 +149,7 @@ def test_the_page_shows_the_sidecar_with_escaped_markup(page: Page) -> None:
     assert "part 2 of the session is missing" in page.words
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_path_of_the_page(products: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = products / "elsewhere"
     assert run_app(["view", str(products / "s1.laz"), "-o", str(folder)]) == 0
@@ -156,6 +158,7 @@ def test_the_command_prints_the_path_of_the_page(products: Path, capsys: pytest.
     assert (folder / "profile.png").exists()
 
 
+@pytest.mark.slow
 def test_json_has_the_numbers(products: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ends = f"{EAST_M},{NORTH_M + 40},{EAST_M + 100},{NORTH_M + 40}"
     code = run_app(["view", str(products), "-o", str(tmp_path), "--json", "--cell", "4", "--profile", ends])

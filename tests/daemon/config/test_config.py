@@ -351,6 +351,7 @@ TOML_VALUES = st.recursive(
 class TestArbitraryInput:
     """Any content is valid or reported in single lines."""
 
+    @pytest.mark.slow
     @settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.too_slow])
     @given(data=st.data())
     def test_any_value_is_valid_or_reported_in_one_line(self, data: st.DataObject) -> None:

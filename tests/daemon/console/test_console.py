@@ -50,6 +50,7 @@ def texts(asked: Asked) -> list[str]:
     return [event["text"] for event in asked.snapshot()["events"]]
 
 
+@pytest.mark.slow
 def test_a_recording_is_told_by_state_sentence_and_sources(aircraft: Aircraft) -> None:
     wait_until(lambda: aircraft.asked.snapshot()["sources"]["raw/camera"]["state"] == "silent", "a silent source")
     found = aircraft.asked.snapshot()

@@ -16,6 +16,7 @@ from tests.daemon.commands import swath
 from tests.daemon.rig import wait_until
 
 
+@pytest.mark.slow
 def test_a_log_grows_at_its_pace_and_is_the_same_in_the_end(tmp_path: Path) -> None:
     """The part spans 0.24 s; at a tenth of its pace that takes two seconds at least."""
     logs, folder = tmp_path / "logs", tmp_path / "grown"

@@ -377,6 +377,7 @@ class TestOtherProtocols:
         entry = DeviceEntry("scanner", "left", spec, None, "robosense-rs16", None, DeviceSettings("scanner/left"), {})
         assert identify(entry, kept, than=0) == "robosense-helios16p or robosense-helios32"
 
+    @pytest.mark.slow
     def test_heads_of_other_models_are_named_despite_an_identical_second_port(self, tmp_path: Path) -> None:
         """Velodyne's position packets are the same for all models, but the data packets are another model's."""
         models = (

@@ -90,6 +90,7 @@ def test_a_bag_is_imported_and_comes_out_of_an_export_as_it_went_in(tmp_path: Pa
     assert content_of(tmp_path / "again") == content
 
 
+@pytest.mark.slow
 def test_a_list_proposes_a_configuration_that_imports_all(tmp_path: Path) -> None:
     """Each topic is recognised by its bytes; the head's second port and the receiver inside the unit follow."""
     ros = Ros("mcap")
@@ -154,6 +155,7 @@ def test_a_list_proposes_a_configuration_that_imports_all(tmp_path: Path) -> Non
     )
 
 
+@pytest.mark.slow
 def test_decoded_messages_are_listed_as_such(tmp_path: Path) -> None:
     """The bag is NovAtel's own, of its driver for ROS 1."""
     bag = tmp_path / "bestpos.bag"

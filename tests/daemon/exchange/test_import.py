@@ -298,6 +298,7 @@ class TestSerialTimes:
             START_NS + 500_000_000 + 20_000_000 * n for n in range(len(ends))
         ]
 
+    @pytest.mark.slow
     def test_a_capture_of_rtklib_is_imported(self, tmp_path: Path) -> None:
         """It has nine minutes of an IMU on a serial line; CR, which upstream lost, is restored before each LF."""
         data = gzip.decompress((RTKLIB / "imu_1934.csv.gz").read_bytes()).replace(b"\n", b"\r\n")
@@ -500,6 +501,7 @@ class TestRefusals:
         assert "nothing written" in done.stderr
         assert not list((tmp_path / "logs").glob("*.mcap"))
 
+    @pytest.mark.slow
     def test_a_modified_export_is_reported(self, tmp_path: Path) -> None:
         config = write_config(tmp_path)
         log = write_log(

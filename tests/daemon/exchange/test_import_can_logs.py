@@ -99,6 +99,7 @@ def test_a_log_of_two_channels_needs_the_devices(tmp_path: Path, config: Config)
     assert data == encode_can_frame(0x18FF50E5, b"\1\2", extended=True)
 
 
+@pytest.mark.slow
 def test_files_that_do_not_fit_are_refused_in_a_line(tmp_path: Path) -> None:
     write_config(tmp_path)
     path, mf4 = write(tmp_path / "a.blf", LOGS["a.blf"]), write(tmp_path / "a.mf4", b"MDF     4.10    ")

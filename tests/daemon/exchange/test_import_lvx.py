@@ -104,6 +104,7 @@ def test_a_head_that_is_not_told_apart_is_named_and_can_be_chosen(tmp_path: Path
     assert capture.passed == {AVIA.code: len(FILES["avia"]())}
 
 
+@pytest.mark.slow
 def test_claims_and_damage_are_shown(tmp_path: Path) -> None:
     """A head set to UTC needs no start; the file is cut in its last package."""
     begun = dt.datetime(2026, 11, 27, 10, 0, 1, tzinfo=dt.UTC)

@@ -79,6 +79,7 @@ def big_log(logs: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_finished_parts_are_copied_and_the_growing_one_is_not(tmp_path: Path, logs: Path, disk: Path) -> None:
     with Recorder(tmp_path, session_table(logs)) as recorder:
         for part in range(2):
@@ -202,6 +203,7 @@ def test_a_copy_that_was_made_otherwise_is_compared_and_listed(logs: Path, disk:
     assert coreutils_agree(disk) == 1
 
 
+@pytest.mark.slow
 def test_verify_reads_again_and_finds_changes(logs: Path, disk: Path) -> None:
     path = logs / "flight_0.mcap"
     write_part(path)

@@ -245,6 +245,7 @@ def test_lost_messages_are_counted_exactly_if_the_end_is_intact(tmp_path: Path, 
     assert examine(path).messages_lost is None
 
 
+@pytest.mark.slow
 def test_a_log_being_recorded_is_read_without_complaint_and_not_recovered(tmp_path: Path) -> None:
     """A copy of the content so far would be mistaken for the log when it is finished."""
     path = tmp_path / f"{INFO.session_id}_0.mcap"
@@ -271,6 +272,7 @@ def test_a_log_being_recorded_is_read_without_complaint_and_not_recovered(tmp_pa
     assert recover(path).recovered is not None
 
 
+@pytest.mark.slow
 def test_a_part_left_empty_by_a_crash_does_not_affect_the_others(tmp_path: Path) -> None:
     good, cut = tmp_path / "a.mcap", tmp_path / "c.mcap"
     write_part(good)
@@ -409,6 +411,7 @@ print(count, saved, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
 """
 
 
+@pytest.mark.slow
 def test_a_log_of_any_length_is_read_and_recovered_in_little_memory(tmp_path: Path) -> None:
     """Merging by time holds one second, here 24 MB, and a chunk or two."""
     path = tmp_path / "long.mcap"

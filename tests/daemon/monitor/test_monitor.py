@@ -139,6 +139,7 @@ def test_monitor_shows_the_sources_and_that_all_is_well(tmp_path: Path, logs: Pa
     assert line.stdout.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_sequence_gaps_and_damaged_messages_degrade_the_verdict(tmp_path: Path, logs: Path) -> None:
     """Three of every hundred datagrams are omitted; one of two sentences has a wrong checksum."""
     port = free_udp_port()
@@ -212,6 +213,7 @@ def test_silent_and_absent_sources_degrade_the_verdict(tmp_path: Path, logs: Pat
     assert said[-1].stdout.startswith("DEGRADED: recording ")
 
 
+@pytest.mark.slow
 def test_without_a_recording_monitor_exits_with_2_and_gives_the_reason(tmp_path: Path, logs: Path) -> None:
     logs.mkdir()
     run = swath("monitor", "--once", str(logs))

@@ -51,6 +51,7 @@ def test_the_function_is_called_once_and_before_compiling_begins() -> None:
     assert calls == ["begins"]
 
 
+@pytest.mark.slow
 def test_a_worker_process_marks_that_it_compiles() -> None:
     context = multiprocessing.get_context("spawn")
     flag = context.Value("d", 0.0)

@@ -99,6 +99,7 @@ def turned(trajectory: Trajectory, change: Any) -> Trajectory:
     return placed(trajectory, *trajectory.geodetic(), angles=change(*trajectory.attitude()))
 
 
+@pytest.mark.slow
 def test_a_correct_trajectory_is_accepted_without_warnings(log: Log, single: Log) -> None:
     for one in (log, single):
         found = one.judged(one.truth)
@@ -134,6 +135,7 @@ def up_by(one: Log, own_m: float, *, metres: float | None = None, sigmas: float 
     return lifted(up_m)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("own_m", "limit", "warned", "refused"),
     [
@@ -327,6 +329,7 @@ def rough(tmp_path_factory: pytest.TempPathFactory) -> list[Log]:
     return flights
 
 
+@pytest.mark.slow
 def test_another_flight_over_the_same_lines_is_refused_by_its_gusts(rough: list[Log]) -> None:
     """The flights turn alike (correlation 0.9) and are a decimetre apart, which the fixes cannot separate."""
     for one, other in (rough, rough[::-1]):

@@ -108,6 +108,7 @@ def test_tiles_in_any_order_give_the_same_cells_and_differences(tmp_path: Path) 
         assert look.agreement.best == first.agreement.best == "QL0", name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("pulses_m2", "cell_m"), [(1.2, 4.0), (5.0, 2.0), (10.0, 1.0)])
 def test_cells_contain_enough_returns_at_any_density_and_thinning(
     tmp_path: Path, pulses_m2: float, cell_m: float
@@ -143,6 +144,7 @@ def test_a_cell_size_given_by_the_user_is_used(tmp_path: Path, capsys: pytest.Ca
     assert caught.value.exit_code == ExitCode.USAGE
 
 
+@pytest.mark.slow
 def test_few_cells_give_no_verdict_but_advice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A meadow of 14 m × 80 m has hundreds of square metres but only dozens of cells."""
     cloud = flown(5.0)

@@ -89,6 +89,7 @@ def test_after_a_warm_up_a_flight_compiles_nothing(tmp_path: Path) -> None:
     assert found["points"] > 20_000
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("signum", "code"), [(signal.SIGTERM, -signal.SIGTERM), (signal.SIGINT, INTERRUPTED)], ids=lambda one: str(one)
 )
@@ -130,6 +131,7 @@ def test_warm_up_reports_the_cache_folder_or_its_absence(tmp_path: Path) -> None
     assert "compiles in memory; set NUMBA_CACHE_DIR" in WarmUp(12, 3.25, None).text()
 
 
+@pytest.mark.slow
 def test_a_wrong_configuration_is_refused_in_one_line(tmp_path: Path) -> None:
     config = tmp_path / "swath.toml"
     config.write_text('[session]\nname = "a"\nspeed = 3\n')

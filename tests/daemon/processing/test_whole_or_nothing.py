@@ -66,6 +66,7 @@ def test_an_export_is_synced_to_the_disk(tmp_path: Path, synced: Synced) -> None
     assert len(list((tmp_path / "out").rglob("*"))) > 4
 
 
+@pytest.mark.slow
 def test_points_are_synced_to_the_disk(tmp_path: Path, synced: Synced) -> None:
     flown = fly(tmp_path)
     synced.clear()

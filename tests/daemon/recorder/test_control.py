@@ -105,6 +105,7 @@ def test_a_note_is_logged_with_its_time(tmp_path: Path, logs: Path) -> None:
     assert re.search(r"^  \d\d:\d\d:\d\d mark: line 4 start σ\n  \d\d:\d\d:\d\d mark: line 4 end$", shown, re.MULTILINE)
 
 
+@pytest.mark.slow
 def test_split_begins_a_part_and_loses_no_data(tmp_path: Path, logs: Path) -> None:
     with (
         contextlib.closing(Numbers(free_udp_port())) as numbers,
@@ -127,6 +128,7 @@ def test_split_begins_a_part_and_loses_no_data(tmp_path: Path, logs: Path) -> No
     assert [event["text"] for event in content.events("part_closed")] == [path.name for path in paths[1:]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [("mark", "x"), ("split",)])
 def test_without_a_recorder_the_error_is_one_line(tmp_path: Path, logs: Path, command: tuple[str, ...]) -> None:
     logs.mkdir()
@@ -219,6 +221,7 @@ def test_the_socket_is_in_the_runtime_directory_and_linked_from_the_log_director
     assert "RuntimeDirectory=swath" in (ROOT / "systemd/swathd.service").read_text().splitlines()
 
 
+@pytest.mark.slow
 def test_a_stale_socket_is_replaced(tmp_path: Path, logs: Path) -> None:
     with Recorder(tmp_path, session_table(logs)) as recorder:
         recorder.kill()
@@ -229,6 +232,7 @@ def test_a_stale_socket_is_replaced(tmp_path: Path, logs: Path) -> None:
         assert recorder.stop() == 0
 
 
+@pytest.mark.slow
 def test_a_socket_in_use_is_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     runtime = tmp_path / "run"
     runtime.mkdir()

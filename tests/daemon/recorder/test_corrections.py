@@ -123,6 +123,7 @@ def test_a_serial_base_is_logged_without_a_receiver(tmp_path: Path) -> None:
     assert "forwarded_bytes" not in status
 
 
+@pytest.mark.slow
 def test_an_absent_receiver_does_not_stop_the_recording(tmp_path: Path) -> None:
     logs = tmp_path / "logs"
     sent = threading.Event()

@@ -83,6 +83,7 @@ def faulty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultyCa
     bus.close()
 
 
+@pytest.mark.slow
 def test_bus_off_and_error_frames_are_reported_and_the_bus_is_reopened(
     tmp_path: Path, logs: Path, faulty: FaultyCan
 ) -> None:
@@ -345,6 +346,7 @@ def segments(logs: Path, source: str) -> int:
     return clock.status().segments
 
 
+@pytest.mark.slow
 def test_restarts_and_repeated_or_reordered_datagrams_are_reported_as_such(tmp_path: Path, logs: Path) -> None:
     """Units are recorded unchanged and reported by their kind, never as gaps; a restart is a new segment."""
     dbc = Path(__file__).resolve().parents[3] / "fixtures" / "config" / "imu.dbc"
@@ -450,6 +452,7 @@ def babble(wire: Wire, data: bytes) -> None:
         wire.send(data[at : at + 460])
 
 
+@pytest.mark.slow
 def test_a_device_still_opening_at_the_end_has_lost_no_data(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as mute:  # a gateway that takes connections and says nothing
         transport = f"can:socketcand:can0?host=127.0.0.1&port={mute.getsockname()[1]}"

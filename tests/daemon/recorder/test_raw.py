@@ -28,6 +28,7 @@ CANMOD = ROOT / "fixtures/canmod-gps/3BA199E2_00000164_00000005_candump.log.gz"
 GROUP = "239.74.163.2"
 
 
+@pytest.mark.slow
 def test_raw_devices_are_recorded_over_every_wire_and_healthy_everywhere(tmp_path: Path) -> None:
     logs, udp, bus_port = tmp_path / "logs", free_udp_port(), free_udp_port()
     with ExitStack() as stack:

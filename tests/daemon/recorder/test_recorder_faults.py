@@ -126,6 +126,7 @@ def test_data_in_the_kernel_at_the_end_are_recorded(tmp_path: Path, logs: Path, 
     assert last_status(content)["units"] == 10_000
 
 
+@pytest.mark.slow
 def test_part_changes_under_load_lose_and_reorder_no_data(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     config = session_table(logs, split_size_mb=1) + scanner(numbers.port)
     with Recorder(tmp_path, config) as recorder:
@@ -157,6 +158,7 @@ def read_events(path: Path) -> list[dict[str, Any]]:
     return [value for _, value in content.messages["/events"]]
 
 
+@pytest.mark.slow
 def test_a_directory_removed_during_recording_is_made_again(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     with Recorder(tmp_path, session_table(logs) + scanner(numbers.port)) as recorder:
         recorder.wait_said("device_opened")
@@ -197,6 +199,7 @@ def test_the_remains_of_a_part_after_a_power_cut_are_not_recovered_at_every_star
     assert unfinished_logs(tmp_path) == [whole]
 
 
+@pytest.mark.slow
 def test_lock_and_control_socket_are_restored_with_the_directory(tmp_path: Path, logs: Path) -> None:
     config = session_table(logs)
     with Recorder(tmp_path / "one", config) as recorder:
@@ -346,6 +349,7 @@ def test_a_restart_within_the_same_second_takes_another_name(tmp_path: Path, log
     assert len({path.stem.rsplit("_", 1)[0] for path in logs.glob("test*_0.mcap")}) == 3
 
 
+@pytest.mark.slow
 def test_a_failing_writer_ends_the_process(tmp_path: Path, logs: Path, numbers: Numbers) -> None:
     config = session_table(logs) + scanner(numbers.port)
     with Recorder(tmp_path, config, module=(SPECIAL, "broken-writer")) as recorder:

@@ -24,6 +24,7 @@ def sender() -> Iterator[socket.socket]:
         yield sock
 
 
+@pytest.mark.slow
 def test_every_byte_of_every_wire_is_logged(tmp_path: Path, logs: Path, sender: socket.socket) -> None:
     port, link, fifo = free_udp_port(), tmp_path / "rover", tmp_path / "pps"
     os.mkfifo(fifo)
@@ -146,6 +147,7 @@ def test_an_unread_journal_blocks_nothing(tmp_path: Path, logs: Path) -> None:
     assert {event["source"] for event in content.events("device_absent")} == {"gnss/rover", "pps/main"}
 
 
+@pytest.mark.slow
 def test_a_serial_port_unplugged_and_plugged_in_again_is_reopened(tmp_path: Path, logs: Path) -> None:
     link, fifo = tmp_path / "rover", tmp_path / "pps"
     os.mkfifo(fifo)

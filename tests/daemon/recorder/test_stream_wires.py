@@ -98,6 +98,7 @@ def _unread(terminal: int) -> int:
     return waiting[0]
 
 
+@pytest.mark.slow
 def test_every_stream_is_recorded_and_read_over_every_wire(tmp_path: Path) -> None:
     """All drivers and wires are in one recorder: the log has each byte, and its records are those of the recording."""
     assert {driver.protocol for driver in STREAMS} >= {"nmea", "ubx", "sbf", "novatel", "xsens-xbus", "rtcm3"}
@@ -223,6 +224,7 @@ def test_replay_serves_the_tcp_port_that_a_recorder_connects_to() -> None:
         TcpOutput(TransportSpec("tcp", "192.0.2.1:5000", {}, "tcp:192.0.2.1:5000"))
 
 
+@pytest.mark.slow
 def test_two_heads_on_one_port_are_two_sources_and_strangers_are_named(tmp_path: Path) -> None:
     port, logs = free_udp_port(), tmp_path / "logs"
     config = session_table(logs)

@@ -420,6 +420,7 @@ CRASHES = [(5642, "2c0f424c"), (5648, "0010"), (16812, "ffffffff")]
 GIGABYTES = [(1077, "feffffff"), (7227, "f87f"), (17200, "0100"), (17203, "7f")]
 
 
+@pytest.mark.slow
 def test_mf4_of_a_logger_is_read_as_its_candump_log(tmp_path: Path) -> None:
     """Both are recordings of the same minute; asammdf's times are floats, a nanosecond apart at most."""
     path = FIXTURES / "canmod-gps" / "2F6913DB_00000004_00000001.MF4.gz"

@@ -58,6 +58,7 @@ def chunks(data: bytes, size: int) -> bytes:
     return b"".join(b"%x;part=1\r\n%s\r\n" % (len(part), part) for part in parts)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "parts",
     [

@@ -96,6 +96,7 @@ def written_out(one: Unit, other: Unit, place: FloatArray, place_2: FloatArray, 
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("second", [(2, 255.0, "left"), (2, 255.0, "right"), (1, 75.0, "left")])
 def test_cross_covariances_are_the_sum_of_the_shared_errors(second: tuple[int, float, str]) -> None:
     first = unit()
@@ -109,6 +110,7 @@ def test_cross_covariances_are_the_sum_of_the_shared_errors(second: tuple[int, f
     np.testing.assert_allclose(found[0], written_out(first, other, place[0], place_2[0], 4, 7), rtol=1e-12, atol=1e-16)
 
 
+@pytest.mark.slow
 def test_a_point_has_the_noise_besides() -> None:
     one = unit()
     model, place = ErrorModel([one], SLOW), np.array([[100.0, 400.0, 20.0]])

@@ -245,6 +245,7 @@ def tree() -> tuple[Points, bytes]:
     return points, copc(points)
 
 
+@pytest.mark.slow
 def test_copc_holds_the_same_points(tree: tuple[Points, bytes]) -> None:
     points, data = tree
     with laspy.CopcReader(io.BytesIO(data)) as reader:

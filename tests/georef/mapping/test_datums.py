@@ -37,6 +37,7 @@ def refusal(crs: str, **settings: Any) -> str:
     return line
 
 
+@pytest.mark.slow
 def test_itrf_to_etrs89_is_not_the_identity() -> None:
     """EPSG:7912 at 2026.47 → EPSG:25832 at 47.55° N 9° E moves points by −0.729 m east and −0.581 m north.
 
@@ -78,6 +79,7 @@ def test_wgs_84_to_utm_on_wgs_84_is_taken(datum: str | None) -> None:
     np.testing.assert_allclose(mapping.exact(at(47.5, 9.1))[0], expected, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_itrf_to_utm_on_wgs_84_names_the_realisation() -> None:
     """G2139 equals ITRF2014 to 1 cm (EPSG) and is a member of the ensemble on which EPSG:32632 is based."""
     mapping = Mapping("EPSG:32632", datum="EPSG:7912")
@@ -144,6 +146,7 @@ def test_a_ballpark_transformation_is_refused() -> None:
     assert "would guess" in refusal("EPSG:2056", datum="EPSG:7912", accuracy_m=1000.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("crs", "datum", "grid"),
     [

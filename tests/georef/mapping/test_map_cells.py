@@ -155,6 +155,7 @@ def test_points_outside_any_cube_are_computed_by_the_exact_map() -> None:
     assert np.isnan(made.map_with_sigmas(points, covariance)[1]).all(axis=1).tolist() == [True, True, False]
 
 
+@pytest.mark.slow
 def test_sigmas_follow_the_law_of_propagation() -> None:
     """The expected values are J Σ Jᵀ written with matrices, in units of half a metre."""
     random = np.random.default_rng(5)

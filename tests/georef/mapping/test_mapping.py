@@ -106,6 +106,7 @@ def test_coordinates_are_continuous_across_the_antimeridian_and_the_pole() -> No
     assert here[1] < 2e6 < there[1]  # UPS north: grid north is along 180°
 
 
+@pytest.mark.slow
 def test_a_point_maps_the_same_alone_and_among_others() -> None:
     """Results are equal bit for bit, also in a copy pickled as for another process."""
     frame = Mapping("EPSG:25832", datum="EPSG:7912", epoch=2026.47)

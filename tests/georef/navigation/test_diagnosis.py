@@ -36,6 +36,7 @@ def codes(parts: Parts) -> list[str]:
     return [finding.code for finding in diagnose(*parts)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kinds", [(Kind.POSITION, Kind.VELOCITY), (Kind.POSITION,)], ids=["both", "positions"])
 @pytest.mark.parametrize(
     "recording",
@@ -222,6 +223,7 @@ FAULTS: list[tuple[str, Callable[[Parts], Parts], str, str]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("fault", "code", "words"), [case[1:] for case in FAULTS], ids=[case[0] for case in FAULTS])
 def test_a_fault_is_found_and_named(fault: Callable[[Parts], Parts], code: str, words: str) -> None:
     sound = survey()
@@ -265,6 +267,7 @@ def test_remedy_for_rotated_axes_is_right() -> None:
     assert codes(installed(np.array(json.loads(said[1]), dtype=np.float64))(parts)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("recording", [lambda: reference("mems"), uav], ids=["mems", "uav"])
 @pytest.mark.parametrize("seconds", [0.3, -1.25])
 def test_time_offsets_are_measured(recording: Callable[[], Recording], seconds: float) -> None:
@@ -307,6 +310,7 @@ def velocity_innovations(rows: StructArray, size_mps: float) -> StructArray:
     return found
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("size_mps", "told"), [(0.02, False), (2.0, True)])
 def test_a_filter_that_follows_gnss_rules_out_a_time_offset(size_mps: float, told: bool) -> None:
     """An offset of 0.3 s would show as more than one metre per second in the velocities of the turns."""
@@ -316,6 +320,7 @@ def test_a_filter_that_follows_gnss_rules_out_a_time_offset(size_mps: float, tol
     assert ("time_offset" in [finding.code for finding in diagnose(*parts, solved)]) == told
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("taken_out_s", "told"), [(-0.3, []), (0.0, ["time_offset"])])
 def test_an_offset_already_removed_by_the_filter_is_not_reported_again(taken_out_s: float, told: list[str]) -> None:
     sound = survey()

@@ -61,6 +61,7 @@ def found_of(receiver: Receiver, seconds: float, seed: int, *, doubted: bool = F
     return assumed, find_heading_noise(nothing, stretch(assumed), stretch)
 
 
+@pytest.mark.slow
 def test_white_headings_are_recognised_as_white() -> None:
     _, found = found_of(DUAL_ANTENNAS["white"], 180.0, 3)
     assert found.setup.gnss_heading_share == 0.0
@@ -68,6 +69,7 @@ def test_white_headings_are_recognised_as_white() -> None:
     assert found.heading_evidence > EVIDENCE
 
 
+@pytest.mark.slow
 def test_heading_errors_correlated_over_seconds_are_found() -> None:
     """Half of the variance lasts for 10 s; white sigma is found to a tenth, lasting to a fifth, the time roughly."""
     _, found = found_of(DUAL_ANTENNAS["half lasting 10 s"], 240.0, 3)
@@ -87,6 +89,7 @@ def test_headings_keep_their_assumed_noise_if_it_cannot_be_estimated(doubted: bo
     assert found.heading_evidence == 0.0
 
 
+@pytest.mark.slow
 def test_errors_with_correlated_headings_are_as_large_as_their_sigmas() -> None:
     """12 flights are solved with the true heading noise; the attitude's NEES must be within its 99.8 % interval."""
     receiver = DUAL_ANTENNAS["half lasting 10 s"]

@@ -20,6 +20,7 @@ pytestmark = pytest.mark.xdist_group("kernels")
 ARM = np.array([0.35, -0.12, -1.1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.0, 0.7], ids=["white", "lasting"])
 @pytest.mark.parametrize("grade", ["tactical", "mems"])
 def test_errors_are_as_large_as_their_sigmas(grade: str, share: float) -> None:

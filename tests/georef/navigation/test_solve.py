@@ -24,6 +24,7 @@ pytestmark = pytest.mark.xdist_group("kernels")
 ARM = np.array([0.35, -0.12, -1.1])
 
 
+@pytest.mark.slow
 def test_a_flight_that_begins_in_the_air_is_as_accurate_at_its_start() -> None:
     """It begins on a line with a heading that is wrong by 8° and has a sigma of 10°; the first minute is as good."""
     flown = reference("tactical").cut(100_640.0, 101_550.0)
@@ -71,6 +72,7 @@ def ticking(inertial: Inertial) -> Inertial:
     return replace(inertial, time_ns=time_ns, interval_s=interval_s)
 
 
+@pytest.mark.slow
 def test_the_logging_delay_of_the_car_is_found() -> None:
     """Its makers configure 0.125 s; only positions are used, because the velocities are means over 0.25 s."""
     drive, start = car(), start_of("gnss_imu_drive", "meta")
@@ -114,6 +116,7 @@ def test_the_trajectory_of_a_late_imu_is_given_at_gnss_times() -> None:
     assert np.concatenate(squared)[:, 3:].mean() == pytest.approx(1.0, abs=0.6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("raw", "filtered_m", "smoothed_m"), [(False, 11.5, 0.53), (True, 11.5, 0.53)])
 def test_the_outages_of_the_car_are_bridged_as_accurately_as_published(
     raw: bool, filtered_m: float, smoothed_m: float
@@ -139,6 +142,7 @@ def test_the_outages_of_the_car_are_bridged_as_accurately_as_published(
 FLIGHT_S = 600.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "share"), [(1.0, 0.0), (2.5, 0.0), (1.0, 0.8)])
 def test_noise_different_from_the_stated_sigmas_is_found(scale: float, share: float) -> None:
     """Fixes are as good as stated, worse by 2.5, or have errors that last a minute; the noise is found and used."""
@@ -153,6 +157,7 @@ def test_noise_different_from_the_stated_sigmas_is_found(scale: float, share: fl
     assert (found.gnss_correlated_share > 0.0) == (share > 0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", ["frozen", "wrong fix"])
 def test_seconds_of_blunders_do_not_hide_the_noise_of_the_flight(fault: str) -> None:
     """A receiver repeats itself for 5 s, or has a wrong fix for 20 s; lasting errors are still found.
@@ -172,6 +177,7 @@ def test_seconds_of_blunders_do_not_hide_the_noise_of_the_flight(fault: str) -> 
     assert np.mean((off / found.position_sigma_l[far]) ** 2) < 1.0 + 3 * 0.4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("velocity_mps", [0.02, 0.0], ids=["velocities", "positions alone"])
 def test_a_wrong_fix_does_not_move_the_trajectory(velocity_mps: float) -> None:
     """A fix that jumps by 1.6 m between epochs is refused for all of its 20 s, and errors stay within their sigmas."""

@@ -60,6 +60,7 @@ def test_a_flight_of_the_configured_grade_gives_no_advice() -> None:
     assert contradicted(run, setup) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("field", "told"), [("gyro_scale", 1e-5), ("misalignment", 0.0)])
 def test_an_implausible_scale_factor_or_misalignment_is_reported(field: str, told: float) -> None:
     """The unit has 5 mrad or 0.5 %, and the configuration states almost zero."""

@@ -36,6 +36,7 @@ def longer_m(ticks: int, tick_hz: int, group_index: float, about_m: float) -> fl
     return float(found["range_m"]) - APPARENT_M
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("flight_us", "group_index", "range_m", "within_m"),
     [

@@ -141,6 +141,7 @@ def expected(case: Case, calibration: Calibration, flights: Flights, shots: Shot
     return points_e
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", CASES)
 def test_the_model_is_exact_everywhere_on_earth_with_every_error(kind: str) -> None:
     case, rng = CASES[kind], np.random.default_rng(5)

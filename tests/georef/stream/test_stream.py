@@ -220,6 +220,7 @@ def test_a_scanner_without_latch_runs_free_and_is_refused() -> None:
     assert sum(len(points) for _, points in worse.placed) > 900
 
 
+@pytest.mark.slow
 def test_after_a_lost_pulse_points_end_when_the_sigma_has_grown() -> None:
     """A device without a latch wanders by some 30 ns/s per √s, so it soon exceeds half a microsecond."""
     tight = StreamSettings(max_time_sigma_ns=500.0)

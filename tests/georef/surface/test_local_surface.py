@@ -210,6 +210,7 @@ def test_feet_give_the_same_surface() -> None:
     np.testing.assert_allclose(np.median(added_m(in_feet)), np.median(added_m(metres)), rtol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_smallest_axis_is_that_of_numpy() -> None:
     rng = np.random.default_rng(8)
     for scale in ([1.0, 0.7, 0.02], [3.0, 0.1, 0.1], [1.0, 1.0, 1e-4], [2.0, 2.0, 2.0]):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -94,6 +95,7 @@ def test_real_clocks_of_this_machine_are_mapped_within_a_millisecond() -> None:
     assert line.raw_at(before) - 1_000_000 < raw < line.raw_at(after) + 1_000_000
 
 
+@pytest.mark.slow
 @settings(max_examples=40, deadline=None)
 @given(
     st.integers(0, 10**6),

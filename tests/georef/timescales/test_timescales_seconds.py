@@ -175,6 +175,7 @@ def expected_events(case: Case) -> tuple[str, ...]:
     return ("second_ambiguous",) if case.steady is COARSE and case.events == ("second_known",) else case.events
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 def test_no_second_is_wrong(case: Case) -> None:
     """The steady state is as expected, and the log gives the reason."""

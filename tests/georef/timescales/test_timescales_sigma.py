@@ -52,6 +52,7 @@ def test_clock_errors_are_as_large_as_their_sigma(noise_ns: float, ramps: bool) 
     assert 0.8 <= figures[1] <= 1.25, figures
 
 
+@pytest.mark.slow
 def test_kernel_timestamps_are_accurate_to_a_microsecond() -> None:
     """Stamps of 1.5 µs without ramps give less than 1 µs RMS locked and less than 5 µs after 60 s of holdover."""
     locked, _, ahead, _ = errors(KERNEL_NS, False)
@@ -59,6 +60,7 @@ def test_kernel_timestamps_are_accurate_to_a_microsecond() -> None:
     assert rms(ahead) < 5_000.0
 
 
+@pytest.mark.slow
 def test_user_space_timestamps_profit_from_a_longer_memory() -> None:
     """Stamps of 300 µs without ramps give less than the 60 µs of a fixed window of 64 s (ACQUISITION 5.3)."""
     locked, _, _, _ = errors(USER_NS, False)
@@ -114,6 +116,7 @@ def test_history_labels_edges_before_the_first_label() -> None:
     assert rms(gps - (START + np.arange(20, 190)) * 10**9) < 2_000
 
 
+@pytest.mark.slow
 def test_live_memory_is_bounded() -> None:
     """Two hours without history keep no more knots than a quarter of an hour or two."""
     simulation = Simulation(START, Oscillator(7200, seed=1), Edges(), [Sender("TIME", week_tag())])

@@ -53,6 +53,7 @@ def distances_m(states: States, flight: Trajectory, seconds: float, lever_arm_b:
     return distances
 
 
+@pytest.mark.slow
 def test_ten_turbulent_minutes_are_integrated_to_a_centimetre(flight: Trajectory) -> None:
     seconds = 60.0 * MINUTES
     assert flight.end_s > seconds

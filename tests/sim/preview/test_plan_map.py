@@ -100,6 +100,7 @@ def test_names_of_lines_that_begin_at_one_place_do_not_overlap(monkeypatch: pyte
     assert overlapping(figure) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lines", [1, 12])
 def test_no_texts_overlap(lines: int, monkeypatch: pytest.MonkeyPatch) -> None:
     figure = drawn(FLAT + "".join(parallel(lines)), monkeypatch)

@@ -50,6 +50,7 @@ def wanted(text: str) -> dict[str, float]:
     return _wanted(cast(Calibrated, SimpleNamespace(kept=kept)))
 
 
+@pytest.mark.slow
 def test_requirements_of_the_configuration_determine_the_verdict() -> None:
     """The path leads from TOML in users' units, through the needs of points, to the words and the level."""
     table = "[calibration.wanted]\npoint_m = {point_m}\nkappa_deg = {kappa_deg}\nrange_scale_ppm = 7.5\n"

@@ -90,6 +90,7 @@ def test_files_that_are_left_out_are_named_where_there_is_no_calibration(
     assert told[1].endswith("no calibration there; give folders with files of swath calibrate")
 
 
+@pytest.mark.slow
 def test_page_pdf_and_csv_are_written(archive: Path, tmp_path: Path) -> None:
     output = tmp_path / "out"
     assert run_app(["history", str(archive), "-o", str(output)]) == 0
@@ -110,6 +111,7 @@ def test_page_pdf_and_csv_are_written(archive: Path, tmp_path: Path) -> None:
     assert (output / "history.pdf").exists()
 
 
+@pytest.mark.slow
 def test_a_table_of_many_parameters_fits_a_sheet_and_dates_do_not_cover_each_other(archive: Path) -> None:
     """Calibrations of one flight have the same date, so their marks are drawn side by side."""
     collected = collect([archive])
@@ -151,6 +153,7 @@ def test_copies_count_once_and_contradicting_ones_are_named(archive: Path, capsy
     assert any(str(archive / "broken.toml") in line and line.endswith("it was left out") for line in lines)
 
 
+@pytest.mark.slow
 def test_a_calibration_only_in_a_record_is_one_of_its_scanner(
     archive: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

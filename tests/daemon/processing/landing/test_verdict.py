@@ -161,6 +161,7 @@ def told_and_expected(seed: int) -> tuple[str, str]:
     return told, f"Fly again: line{'s' if len(again) > 1 else ''} {', '.join(again)}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 4])
 def test_the_verdict_on_a_drawn_flight_is_that_of_its_defects(seed: int) -> None:
     told, expected = told_and_expected(seed)

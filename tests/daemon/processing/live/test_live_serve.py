@@ -111,6 +111,7 @@ def test_a_client_gets_what_the_file_gets(tmp_path: Path) -> None:
     assert got["/status"][-1][1]["message"] == f"second {second}"
 
 
+@pytest.mark.slow
 def test_a_client_that_never_reads_holds_nothing_up(tmp_path: Path) -> None:
     """Without dropping, 400 MB would wait for it."""
     server = LiveServer(0)

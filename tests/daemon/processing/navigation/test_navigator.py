@@ -99,6 +99,7 @@ def one_by_one(batches: Iterable[LogBatch]) -> Iterator[LogBatch]:
             yield from (batch.between(at, min(at + step, count)) for at in range(0, count, step))
 
 
+@pytest.mark.slow
 def test_poses_match_the_truth_within_their_sigmas(followed: Told, flown: Flown) -> None:
     rows, truth = followed[0], flown.truth()
     assert (np.diff(rows["gps_ns"]) > 0).all()

@@ -208,6 +208,7 @@ def test_a_page_ends_with_its_appendix_and_shows_no_empty_column() -> None:
     assert "Appendix" not in html_of(Page("Test page", "Title", PageHead(), []))
 
 
+@pytest.mark.slow
 def test_the_pdf_has_title_author_bookmarks_page_numbers_and_repeats_heads_of_tables() -> None:
     read = PdfReader(io.BytesIO(pdf_of(html_of(page_of(rows=200)))))
     assert read.metadata is not None

@@ -154,6 +154,7 @@ def cut(batches: Iterable[LogBatch], longest: int, seed: int) -> Iterator[LogBat
             first = last
 
 
+@pytest.mark.slow
 def test_every_return_has_a_fate_and_most_are_points(whole: tuple[Placed, LogFeed]) -> None:
     placed, feed = whole
     for name in ("left", "top"):

@@ -126,6 +126,7 @@ def limits_of(case: Case, flown: Flown) -> FloatArray:
     return bound(flown, **SREP_24_BIT)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("air", ["off", "on"])
 @pytest.mark.parametrize("name", CASES)
 def test_every_return_is_placed_where_the_simulated_beam_hit(tmp_path: Path, name: str, air: str) -> None:

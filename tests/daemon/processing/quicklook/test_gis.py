@@ -102,6 +102,7 @@ def means_at_pixels(raster: Any, x: Array, y: Array, values: Array) -> Array:
     return np.asarray(means.reshape(raster.height, raster.width))
 
 
+@pytest.mark.slow
 def test_maps_are_cloud_optimised_and_have_the_crs_and_no_value_where_no_points_are(products: Path) -> None:
     for name in QUICK_LOOK_MAPS:
         with rasterio.open(products / "view" / name) as raster:
@@ -192,6 +193,7 @@ def test_lines_follow_the_trajectory_over_each_strips_time(products: Path) -> No
         )
 
 
+@pytest.mark.slow
 def test_control_residuals_of_both_records_lie_at_the_surveyed_place(
     products: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -208,6 +210,7 @@ def test_control_residuals_of_both_records_lie_at_the_surveyed_place(
     assert "validation.json: a control point is left out" in told.err
 
 
+@pytest.mark.slow
 def test_one_strip_without_a_crs_gives_maps_without_one_and_a_note(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -227,12 +230,14 @@ def test_one_strip_without_a_crs_gives_maps_without_one_and_a_note(
     assert not (tmp_path / "view" / QUICK_LOOK_FEATURES).exists()
 
 
+@pytest.mark.slow
 def test_lines_are_those_of_the_strips_that_were_looked_at(products: Path, tmp_path: Path) -> None:
     assert run_app(["view", str(products / "s2.laz"), "--gis", "-o", str(tmp_path / "view")]) == 0
     _, _, columns = features_of(tmp_path, "lines")
     assert list(columns["strip"]) == ["2"]
 
 
+@pytest.mark.slow
 def test_coordinates_in_feet_stay_in_feet(tmp_path: Path) -> None:
     foot_m = 1200.0 / 3937.0
     x, y = (axis / foot_m for axis in lattice(EAST_M, NORTH_M, 60.0, 40.0, 0.5))

@@ -56,6 +56,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> tuple[Look, Path]:
     return look, copc
 
 
+@pytest.mark.slow
 def test_points_of_copc_are_read_from_any_offset(both: tuple[Look, Path]) -> None:
     path = both[1] / "s1.copc.laz"
     everything = np.asarray(laspy.read(path).x)

@@ -100,6 +100,7 @@ def test_mistakes_are_answered_in_a_sentence(
     assert not (tmp_path / "out").exists() or not any((tmp_path / "out").iterdir())
 
 
+@pytest.mark.slow
 def test_an_export_is_replaced_only_when_asked(flown: Flown, tmp_path: Path) -> None:
     exported(flown, tmp_path, "npz", "--source", "imu/main")
     again = ("export", str(flown.folder / "logs"), str(tmp_path), "--records", "npz", "--source", "gnss/rover")

@@ -108,6 +108,7 @@ def flown_config() -> ScannerConfig:
     return ScannerConfig(transport="udp:0.0.0.0:2368", protocol="srep", mirror_factor=2.0)
 
 
+@pytest.mark.slow
 def test_normalised_errors_have_unit_variance(tmp_path: Path) -> None:
     found = []
     for seed in (1, 2):

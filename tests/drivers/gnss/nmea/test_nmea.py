@@ -167,6 +167,7 @@ def test_dates_several_rollovers_behind_are_corrected(weeks: int, name: str) -> 
     assert f"sends the date {said}, {behind} 1024 weeks behind; corrected to 2026-11-21" in line
 
 
+@pytest.mark.slow
 def test_records_do_not_depend_on_how_the_stream_is_cut() -> None:
     outcome = check_stream(make, recording("nmea", "ublox-8.log"))
     assert outcome.counters["bad_checksums"] == outcome.counters["bad_messages"] == 0

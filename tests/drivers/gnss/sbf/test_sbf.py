@@ -96,6 +96,7 @@ def test_records_do_not_depend_on_how_the_longest_recording_is_cut() -> None:
     check_stream(make, recording("sbf", "sbfdata.log"))
 
 
+@pytest.mark.slow
 def test_records_of_concatenated_recordings_do_not_depend_on_how_they_are_cut() -> None:
     check_stream(make, b"".join(recording("sbf", name) for name in RECORDINGS if name != "sbfdata.log"))
 

@@ -200,6 +200,7 @@ def test_tim_tp_pulses_of_an_old_receiver_are_decoded() -> None:
     assert tag.time_ns == (333_344 - 3 * 86_400) * 1_000_000_000
 
 
+@pytest.mark.slow
 def test_records_do_not_depend_on_how_the_stream_is_cut() -> None:
     """The stream mixes UBX and RTCM3 and has epochs of many messages."""
     outcome = check_stream(make, recording("ubx", "ublox-zed-f9t-rtcm3.log"))

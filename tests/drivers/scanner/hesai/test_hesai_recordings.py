@@ -46,6 +46,7 @@ def turns_rad(model: Model, rows: StructArray, raw: StructArray) -> FloatArray:
     return turns
 
 
+@pytest.mark.slow
 @EVERY_MODEL
 def test_points_agree_with_the_golden_cloud_of_nebula(model: Model) -> None:
     """nebula omits the rotation between reading the azimuth and firing; without it every point is found."""

@@ -178,6 +178,7 @@ def test_a_recording_without_gps_gives_returns_but_no_time() -> None:
     assert rev_per_s == pytest.approx(10.0, abs=0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["mrpt_vlp16_gps.pcap.gz", "nebula_vlp16.pcap.gz"])
 def test_returns_do_not_depend_on_how_batches_are_cut(name: str) -> None:
     units = payloads(f"velodyne/{name}")

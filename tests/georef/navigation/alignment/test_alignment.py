@@ -73,6 +73,7 @@ def found(recording: Recording) -> AlignedStart:
     return align(recording.inertial, recording.rows, recording.setup)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tactical", "mems"])
 @pytest.mark.parametrize("kinds", [(Kind.POSITION, Kind.VELOCITY), (Kind.POSITION,)], ids=["both", "positions"])
 def test_starts_anywhere_in_a_flight_are_as_accurate_as_their_sigmas(name: str, kinds: tuple[Kind, ...]) -> None:
@@ -93,6 +94,7 @@ def test_starts_anywhere_in_a_flight_are_as_accurate_as_their_sigmas(name: str, 
     assert np.abs(each).max() < 4.0
 
 
+@pytest.mark.slow
 def test_seeds_scatter_as_their_sigmas_predict() -> None:
     errors = []
     for seed in range(24):
@@ -103,6 +105,7 @@ def test_seeds_scatter_as_their_sigmas_predict() -> None:
     assert (spread < 1.42).all()
 
 
+@pytest.mark.slow
 def test_gyroscopes_that_sense_earth_rotation_find_north_at_rest() -> None:
     noise, errors = GRADES["navigation"], []
     for seed in range(5):
@@ -116,6 +119,7 @@ def test_gyroscopes_that_sense_earth_rotation_find_north_at_rest() -> None:
     assert 0.4 < np.sqrt(np.mean(np.array(errors)[:, :2] ** 2)) < 1.5
 
 
+@pytest.mark.slow
 def test_gyroscopes_that_cannot_sense_earth_rotation_wait_for_motion_and_report_it() -> None:
     recording = made(parked(200.0), 64.0, GRADES["mems"], 3, lever_arm_b=ARM)
     with pytest.raises(AlignmentError, match=r"roll/pitch 0\.\d+° yet: waits for first motion") as refused:
@@ -178,6 +182,7 @@ def test_a_second_antenna_gives_the_heading_at_once(heading_deg: float) -> None:
     assert 0.4 < np.sqrt(np.mean(np.array(errors)[:, :3] ** 2)) < 1.5
 
 
+@pytest.mark.slow
 def test_heading_of_a_straight_flight_is_its_course_with_the_sigma_of_crabbing() -> None:
     off = []
     for seed, crab in enumerate([-12.0, 3.0, 9.0]):
@@ -233,6 +238,7 @@ def test_a_given_attitude_is_used_and_propagated() -> None:
     assert np.degrees(start.attitude_sigma_rad[2]) < 0.6
 
 
+@pytest.mark.slow
 def test_heading_of_a_real_car_matches_its_direction_of_travel() -> None:
     drive, off = car(), []
     begin = (int(drive.inertial.time_ns[0]) - BEGIN_NS) / 1e9

@@ -273,6 +273,7 @@ def test_a_real_flight_with_metre_level_gps_is_processed() -> None:
     assert np.sqrt(np.mean(position["value"][:, :2] ** 2)) < 3.0
 
 
+@pytest.mark.slow
 def test_a_live_filter_keeps_only_the_latest_innovations() -> None:
     """A live filter counts all innovations, as one that keeps them all does, but its memory is bounded."""
     truth = fly(survey(), 60.0, 100.0)

@@ -33,6 +33,7 @@ pytestmark = pytest.mark.xdist_group("kernels")
 ARM = np.array([0.35, -0.12, -1.1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["tactical", "mems"])
 def test_the_reference_flight_is_smoothed_as_accurately_as_published(name: str) -> None:
     """With positions only, each figure is within a tenth of the smoother in the data set's README, in outages too."""

@@ -53,6 +53,7 @@ def at_rest(
     return samples(edges, angle, push), state_of(position_e[0], np.zeros(3), rot)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("lat_deg", "lon_deg", "height_m"),
     [(90.0, 0.0, 30.0), (-90.0, 0.0, 2800.0), (89.9999999, 120.0, 0.0), (47.0, 180.0, 500.0), (-20.0, 8.0, 6000.0)],
@@ -152,6 +153,7 @@ def test_an_hour_shows_schuler_oscillation(what: str) -> None:
     assert np.abs(north - expected).max() < 0.002 * np.abs(expected).max()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:The copy keyword")
 def test_three_minutes_match_pyins() -> None:
     """Both integrate the increments of the reference flight; above the ground pyins' gravity differs by 3e-6 m/s²."""
