@@ -115,7 +115,7 @@ def _heads(*patterns: str) -> list[bytes]:
 def _pcaps() -> list[bytes]:
     """Return the beginnings of captures, one of them gzipped and cut off."""
     found = _heads("*/*.pcap.gz")
-    return [*found, gzip.compress(found[0])[:-20]]
+    return [*found, gzip.compress(found[0], mtime=0)[:-20]]
 
 
 def _networks() -> list[bytes]:
@@ -179,7 +179,7 @@ def _lvxs() -> list[bytes]:
     first = [[lvx1_package(0, unit)] for unit in sorted(FILES["avia"](), key=len)[:12]]
     second = [[lvx2_package(7, unit)] for unit in sorted(FILES["mid360"](), key=len)[:5]]
     found = [lvx_file(1, [heads["avia"]], first), lvx_file(2, [heads["mid360"]], second)]
-    return [*found, gzip.compress(found[1])[:-20]]
+    return [*found, gzip.compress(found[1], mtime=0)[:-20]]
 
 
 def _read_lvx(path: Path, tally: CaptureTally | None) -> Iterator[object]:
@@ -264,7 +264,7 @@ def _tables() -> Target:
     parquet = io.BytesIO()
     columns = {"unix_ns": [1_781_514_000_000_000_000, None], "x_m": [1.0, 2.0], "y_m": [3.0, 4.0], "z_m": [5, 6]}
     pyarrow.parquet.write_table(pyarrow.table(columns), parquet)
-    seeds = [_POINTS, _FIXES, _SAMPLES, gzip.compress(_POINTS)[:-9], parquet.getvalue()]
+    seeds = [_POINTS, _FIXES, _SAMPLES, gzip.compress(_POINTS, mtime=0)[:-9], parquet.getvalue()]
     return dataclasses.replace(_captures("table", seeds, _read_table), peak_bytes=lambda size: (64 << 20) + 400 * size)
 
 
