@@ -17,7 +17,6 @@ from swath.drivers.scanner.ouster.head import read_head
 from swath.georef.arrays import FloatArray, Int64Array
 from swath.sim.scanners import ouster_wire
 from swath.sim.scanners.spinning_wire import HeadClock
-from tests.daemon import one_line
 from tests.daemon.one_line import PLAN, Flown, fly
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("kernels")]
@@ -41,11 +40,10 @@ def flown_by(folder: Path, beside_utc_s: float) -> Flown:
         return UNIX_NS + np.floor((np.asarray(time_s) + beside_utc_s) * 1e9).astype(np.int64)
 
     with (
-        patch.object(one_line, "PLAN", SHORT),
         patch.object(HeadClock, "ticks", ticks),
         patch.object(ouster_wire, "SYNC_PULSE", "TIME_FROM_PTP_1588"),
     ):
-        flown = fly(folder)
+        flown = fly(folder, SHORT)
     assert read_head((flown.folder / "left.json").read_bytes()).timestamp_mode == "TIME_FROM_PTP_1588"
     return flown
 
