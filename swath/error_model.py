@@ -75,11 +75,8 @@ class ErrorModel:
 
         The arguments are those of `covariance`, for each side.
         """
-        first, second = (
-            self._packed(xyz_1, gps_ns_1, strip_1, channel_1),
-            self._packed(xyz_2, gps_ns_2, strip_2, channel_2),
-        )
-        return self._file.model.difference(*first, *second)
+        first = self._packed(xyz_1, gps_ns_1, strip_1, channel_1)
+        return self._file.model.difference(*first, *self._packed(xyz_2, gps_ns_2, strip_2, channel_2))
 
     def cross_covariance(
         self,
@@ -91,11 +88,8 @@ class ErrorModel:
 
         The arguments are those of `covariance`, for each side.
         """
-        first, second = (
-            self._packed(xyz_1, gps_ns_1, strip_1, channel_1),
-            self._packed(xyz_2, gps_ns_2, strip_2, channel_2),
-        )
-        return self._file.model.cross_covariance(*first, *second)
+        first = self._packed(xyz_1, gps_ns_1, strip_1, channel_1)
+        return self._file.model.cross_covariance(*first, *self._packed(xyz_2, gps_ns_2, strip_2, channel_2))
 
     def _packed(
         self, xyz: ArrayLike, gps_ns: ArrayLike, strip: ArrayLike, channel: ArrayLike
@@ -105,10 +99,7 @@ class ErrorModel:
         if len(times) != len(places):
             raise ValueError(f"{len(places)} points have {len(times)} times; give one for each")
         strips, channels = (np.broadcast_to(np.asarray(one, np.int64), len(places)) for one in (strip, channel))
-        names = {number: name for name, number in self._file.channels.items()}
-        units = np.empty(len(places), np.int64)
-        for one, of in sorted(set(zip(strips.tolist(), channels.tolist(), strict=True))):
-            units[(strips == one) & (channels == of)] = self._file.model.unit_of(one, names.get(of))
+        units = self._file.units_of(strips, channels)
         return places * self._file.unit_m, times, units
 
 

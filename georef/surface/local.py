@@ -81,9 +81,9 @@ class LocalSurface:
         while at < len(points):
             self._count, at = add_points(self._cubes, self._count, points.points_map, self._unit_m, newest_ns, at)
             if at < len(points):
-                self._make_room(newest_ns - KEPT_NS)
+                self.make_room(newest_ns - KEPT_NS)
 
-    def _make_room(self, since_ns: int) -> None:
+    def make_room(self, since_ns: int) -> None:
         """Forget old cubes; if three quarters of them are younger, double the table."""
         assert self._cubes is not None
         rows = len(self._cubes.keys)
@@ -139,5 +139,5 @@ def warm_up_surface(points: Points, *, level: bool) -> None:
     if not level:
         surface.begin(points)
         surface.add(points)
-        surface._make_room(0)  # noqa: SLF001
+        surface.make_room(0)
     surface.apply(points)

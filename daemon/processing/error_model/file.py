@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from swath.daemon.errors import UserError
-from swath.georef.arrays import FloatArray
+from swath.georef.arrays import FloatArray, Int64Array
 from swath.georef.error_model.model import ErrorModel, ErrorModelError
 from swath.georef.error_model.state import model_of_state, state_of
 
@@ -36,6 +36,21 @@ class ModelFile:
     crs: str
     software: str
     session: str
+
+    def units_of(self, strips: Int64Array, channels: Int64Array) -> Int64Array:
+        """Return the numbers (n,) of the units of points, by their source ids and scanner channels (n,).
+
+        Raises:
+            ErrorModelError: the model has no such strip or scanner.
+        """
+        names = {number: name for name, number in self.channels.items()}
+        units = np.empty(len(strips), np.int64)
+        for strip, channel in sorted(set(zip(strips.tolist(), channels.tolist(), strict=True))):
+            if channel not in names:
+                known = ", ".join(map(str, sorted(names)))
+                raise ErrorModelError(f"the error model has no scanner channel {channel}; it has {known}")
+            units[(strips == strip) & (channels == channel)] = self.model.unit_of(strip, names[channel])
+        return units
 
     def text(self) -> str:
         """Return the content of the file, and of the record in files of points."""

@@ -178,12 +178,8 @@ def _found(
     channels: Int64Array,
     rows: Int64Array,
 ) -> Found:
-    names = {number: name for name, number in file.channels.items()}
-    units = np.empty(len(strips), np.int64)
     try:
-        for strip, channel in sorted({(int(a), int(b)) for a, b in zip(strips, channels, strict=True)}):
-            number = file.model.unit_of(strip, names.get(channel))
-            units[(strips == strip) & (channels == channel)] = number
+        units = file.units_of(strips, channels)
     except ErrorModelError as error:
         raise UserError(f"{path}: {error}; give the files of the run that wrote the model") from error
     time_ns = _gps_ns(gps_time)

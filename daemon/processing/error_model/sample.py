@@ -30,7 +30,7 @@ _RANGE, _ANGLE = OBSERVATIONS.index("range_m"), OBSERVATIONS.index("encoder_rad"
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
-    """What was sampled of a unit; vectors in e.
+    """Returns sampled of a unit, and the effects of errors on them; vectors in e.
 
     Attributes:
         time_ns: (n,) GPS times; points_e, position_e: (n, 3) of point and body.

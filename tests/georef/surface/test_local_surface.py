@@ -173,7 +173,7 @@ def test_pieces_and_forgotten_cubes_change_nothing() -> None:
     surface.begin(pieces)
     for first in range(0, len(pieces), 1777):
         surface.add(pieces.take(slice(first, first + 1777)))
-    surface._make_room(-1)
+    surface.make_room(-1)
     parts = [pieces.take(slice(first, first + 999)) for first in range(0, len(pieces), 999)]
     for part in parts:
         surface.apply(part)

@@ -31,9 +31,9 @@ def level(east: FloatArray, north: FloatArray) -> FloatArray:
     return np.full(len(east), 5.0) + 0.0 * north
 
 
-def quiet(strip: int, offset: FloatArray, noise_m: float = 0.0, **changes: float) -> Unit:
+def quiet(strip: int, offset: FloatArray, noise_m: float = 0.0) -> Unit:
     """Return a unit whose only errors are one of the calibration, in the map's axes, and a range noise."""
-    one = unit(strip, **changes)  # type: ignore[arg-type]
+    one = unit(strip)
     calibration = np.zeros((1, 7))
     calibration[0, :3] = path_axes(one.azimuth_rad).T @ offset
     still = np.zeros_like(one.covariance)
@@ -51,7 +51,8 @@ def points_file(folder: Path, units: list[Unit], ground: Ground, count: int = 40
         las.header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
         east, north = rng.uniform(-10.0, 50.0, (2, count))
         las.x, las.y, las.z = east, north, ground(east, north)
-        las.gps_time = np.full(count, one.start_ns / SECOND + 20.0 - 1e9)
+        # the body is above the points then, so that beams are upright
+        las.gps_time = np.full(count, one.start_ns / SECOND - 1e9)
         las.point_source_id = np.full(count, one.strip, np.uint16)
         paths.append(folder / f"strip{one.strip}.laz")
         las.write(paths[-1])
@@ -111,9 +112,8 @@ def test_two_strips_share_the_calibration_and_average_what_they_do_not_share(tmp
 def test_the_noise_of_single_returns_averages_out(tmp_path: Path) -> None:
     paths = points_file(tmp_path, [quiet(1, np.zeros(3), noise_m=0.1)], level)
     told = volume(paths, read_polygon(polygon(tmp_path)), 0.0)
-    beams = 1.0  # nearly vertical from 1000 m
-    expected = 0.1 * beams * 1600.0 / np.sqrt(told["points"])
-    assert told["sigma_m3"] == pytest.approx(told["sigma_of_noise_m3"]) == pytest.approx(expected, rel=0.35)
+    expected = 0.1 * 1600.0 / np.sqrt(told["points"])  # cells weigh alike, of 12 points and some: 5 % more
+    assert told["sigma_m3"] == pytest.approx(told["sigma_of_noise_m3"]) == pytest.approx(expected, rel=0.1)
 
 
 def test_holes_are_left_out_and_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
